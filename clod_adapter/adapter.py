@@ -201,12 +201,15 @@ def extract(
         raise ClodError(
             "the adapted Gaussians have no sigma_d, and so no dial; give the result of adapt"
         )
-    updates, added, near = dict[str, Tensor](), dict[str, Tensor](), adapted
+    updates = dict[str, Tensor]()
+    added = dict[str, Tensor]()
+    near = adapted
     if adapted.near is not None and base.near is None:
         near, far = (adapted.select(rows) for rows in (adapted.near, ~adapted.near))
         added = {name: getattr(far, name).detach().float().cpu().clone() for name in ATTRIBUTES}
     for name in ATTRIBUTES:
-        old, new = getattr(base, name).detach().float(), getattr(near, name).detach().float()
+        old = getattr(base, name).detach().float()
+        new = getattr(near, name).detach().float()
         if old.shape != new.shape:
             raise ClodError(
                 f"{name} is {kind_of(new)}, in the base {kind_of(old)}; give the Gaussians that"
@@ -273,7 +276,8 @@ def _update(name: str, old: Tensor, new: Tensor) -> Tensor:
     delta = exact.half()
     # float16 has 11 bits, but fewer below 6e-5: in a scene of small numbers that is all there is to
     # a difference.
-    error, largest = (delta.float() - exact).abs().amax(), exact.abs().amax()
+    error = (delta.float() - exact).abs().amax()
+    largest = exact.abs().amax()
     return delta if delta.isfinite().all() and error <= HALF_ERROR * largest else new.clone()
 
 

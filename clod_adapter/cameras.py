@@ -247,7 +247,8 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
     centres = torch.stack([camera.position for camera in cameras])
     distances = (centres - centres.mean(0)).norm(dim=1)
     distances = distances * (distances > ROUNDING * centres.norm(dim=1).max())
-    largest, middle = float(distances.max()), float(distances.median())
+    largest = float(distances.max())
+    middle = float(distances.median())
     return 1.1 * (min(largest, 3 * middle) or largest)
 
 

@@ -45,7 +45,8 @@ def excess(frames: Sequence[Frame], milliseconds: float) -> float:
         if age >= NEWEST and abs(distance) > NEAR:
             break
         predicted.append(math.log(max(took / milliseconds, 1e-3)) + EXPONENT * distance)
-    present, newest = median(predicted), median(predicted[:NEWEST])
+    present = median(predicted)
+    newest = median(predicted[:NEWEST])
     noise = median(abs(prediction - present) for prediction in predicted)
     return newest if abs(newest - present) > max(DEAD_BAND, OUTLIER * noise) else present
 

@@ -121,7 +121,8 @@ class Gaussians:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Gaussians):
             return NotImplemented
-        mine, theirs = self.tensors(), other.tensors()
+        mine = self.tensors()
+        theirs = other.tensors()
         if (mine.keys(), self.attenuation, self.screen_filter) != (
             theirs.keys(),
             other.attenuation,

@@ -58,7 +58,8 @@ def _fitted(means: Tensor, shN: Tensor, kept: int, places: Sequence[Place]) -> T
         basis = sh_basis(away / away.norm(dim=1, keepdim=True).clamp(min=1e-12))[
             :, : kept + high.shape[1]
         ]
-        low, lost = basis[:, :kept], (basis[:, kept:, None] * high).sum(1)
+        low = basis[:, :kept]
+        lost = (basis[:, kept:, None] * high).sum(1)
         squares += low[:, :, None] * low[:, None]
         products += low[:, :, None] * lost[:, None]
     ridge = RIDGE * max(len(places), 1) * torch.eye(kept, dtype=torch.float64, device=means.device)

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-WINDOW, SIGMA = 11, 1.5
-C1, C2 = 0.01**2, 0.03**2
+WINDOW = 11
+SIGMA = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -42,7 +44,8 @@ def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     clamped = image.detach().clamp(0, 1).cpu()
-    render, photograph = clamped.numpy(), unit(target, clamped).numpy()
+    render = clamped.numpy()
+    photograph = unit(target, clamped).numpy()
     with np.errstate(divide="ignore"):  # equal images
         value = peak_signal_noise_ratio(photograph, render, data_range=1)
     border = [(WINDOW // 2, WINDOW // 2)] * 2 + [(0, 0)]
@@ -108,14 +111,16 @@ class _FusedLoss(torch.autograd.Function):
         from clod_adapter._kernels import threads
         from clod_adapter._kernels.memory import recycled
 
-        l1, dssim = (1 - ssim_weight) / image.numel(), ssim_weight / image.numel()
+        l1 = (1 - ssim_weight) / image.numel()
+        dssim = ssim_weight / image.numel()
         (height, width, _), workers = image.shape, threads.worker_count()
         shape = (3, height, kernels.stride(width))
         planes = kernels.Planes(*(recycled(shape).numpy() for _ in range(5)))
         for plane in (planes.x, planes.y):
             # lanes beyond the image; margins of the other planes are not read
             plane[:, :, kernels.PAD + width :] = 0
-        sums, differences = np.zeros(workers), np.zeros(workers)
+        sums = np.zeros(workers)
+        differences = np.zeros(workers)
         gradient = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
         images = (tensor.detach().contiguous().numpy() for tensor in (image, target))
         threads.run(kernels.to_planes, workers, *images, planes)
@@ -123,7 +128,8 @@ class _FusedLoss(torch.autograd.Function):
         written = gradient.numpy(), differences
         threads.run(kernels.loss_gradient, workers, planes, width, l1, dssim, *written)
         ctx.save_for_backward(gradient)
-        difference, similarity = float(differences.sum()), float(sums.sum())
+        difference = float(differences.sum())
+        similarity = float(sums.sum())
         return torch.tensor(l1 * difference + ssim_weight - dssim * similarity, dtype=torch.float32)
 
     @staticmethod

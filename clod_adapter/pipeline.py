@@ -71,7 +71,8 @@ class Result:
     def write(self, ply: Path, adapter: Path) -> None:
         """Writes the two files under these names."""
         save_adapter(adapter, self.adapter)
-        version, calibration = self.adapter.version, self.adapter.calibration
+        version = self.adapter.version
+        calibration = self.adapter.calibration
         save(ply, self.gaussians, self.base, version=version, calibration=calibration)
 
 
@@ -108,7 +109,9 @@ def adapt_checkpoint(
         >>> result = clod.adapt_checkpoint(base, scene, clod.AdaptConfig(max_sv=5))
         >>> result.save("model.ply")
     """
-    notes, alignment, against = list[str](), None, "checkpoint" if scene is None else "photographs"
+    notes = list[str]()
+    alignment = None
+    against = "checkpoint" if scene is None else "photographs"
     if config is None:
         config = AdaptConfig.placed() if scene is None else AdaptConfig()
     if scene is not None:
@@ -156,7 +159,8 @@ def calibrated(result: Result, note: Note) -> Result:
 
 def _measured(result: Result, max_sv: float, progress: Listener | None, note: Note) -> Result:
     """The result with its rows on the held-out views, and with frame times that can be compared."""
-    views, plain = result.scene.test, detach(result.gaussians)
+    views = result.scene.test
+    plain = detach(result.gaussians)
     rows = evaluate_all(result.gaussians, views, report_dials(max_sv), progress)
     measured = [
         (result.base.gaussians, result.base_rows),

@@ -129,7 +129,9 @@ class GracefulStop:
     """
 
     def __init__(self, aborts: bool = True, presses: int = 0) -> None:
-        self.requests, self.aborts, self.presses = 0, aborts, presses
+        self.requests = 0
+        self.aborts = aborts
+        self.presses = presses
 
     @property
     def aborted(self) -> bool:

@@ -47,7 +47,8 @@ def in_order(calls: Iterable[Callable[[], Result]], count: int) -> Generator[Res
     If a call raises or the iterator is closed, started calls are waited for and no more are
     started.
     """
-    pool, pending = ThreadPoolExecutor(count), deque[Future[Result]]()
+    pool = ThreadPoolExecutor(count)
+    pending = deque[Future[Result]]()
     try:
         for call in calls:
             pending.append(submit(pool, call))

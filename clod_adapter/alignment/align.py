@@ -45,9 +45,12 @@ def align(
             note.
     """
     alignment, guess = compare_frames(checkpoint, scene, note)
-    ply, images, frame = checkpoint.path, scene.folder or "the photographs", None
+    ply = checkpoint.path
+    images = scene.folder or "the photographs"
+    frame = None
     if guess and guess.clear:
-        scene, frame = scene_in(scene, guess.frame), guess.frame.as_dict() | {"psnr": guess.psnr}
+        scene = scene_in(scene, guess.frame)
+        frame = guess.frame.as_dict() | {"psnr": guess.psnr}
     elif guess or not alignment.fits:
         message = f"{ply}: does not match {images}: {mismatch(alignment, guess)}"
         if required:

@@ -167,8 +167,10 @@ def compare_filters(
             for screen_filter in FILTERS.values()
         ]
     )
-    psnr, names = -10 * error.clamp(min=1e-10).log10(), list(FILTERS)
-    gained, means = psnr - psnr[names.index(expected)], psnr.mean(1)
+    psnr = -10 * error.clamp(min=1e-10).log10()
+    names = list(FILTERS)
+    gained = psnr - psnr[names.index(expected)]
+    means = psnr.mean(1)
     clear = (gained.mean(1) > CLEAR_FILTER) & ((gained > 0).float().mean(1) >= MOST)
     clear &= error.mean(1) < constant * 10 ** (-DOUBTFUL / 10)
     best = names[int(means.where(clear, -math.inf).argmax())] if bool(clear.any()) else expected

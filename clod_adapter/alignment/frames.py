@@ -118,7 +118,8 @@ def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
     not decide it.
     """
     poses = torch.linalg.inv(viewmats.double())
-    centres, forward = poses[:, :3, 3], poses[:, :3, 2]
+    centres = poses[:, :3, 3]
+    forward = poses[:, :3, 2]
     across = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None, :]
     if float(torch.linalg.cond(across.mean(0))) > 1e4:
         return centres.mean(0)
@@ -158,7 +159,8 @@ def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
     poses = torch.linalg.inv(viewmats)
     for rows in NERFSTUDIO_TURNS:
         turn = viewmats.new_tensor(rows)
-        centres, up = poses[:, :3, 3] @ turn.T, turn @ -poses[:, :3, 1].mean(0)
+        centres = poses[:, :3, 3] @ turn.T
+        up = turn @ -poses[:, :3, 1].mean(0)
         rotation = _turning(up, viewmats.new_tensor([0.0, 0, 1]))
         farthest = float(((centres - centres.mean(0)) @ rotation.T).abs().max())
         if farthest > 0:
@@ -173,7 +175,8 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     """
     poses = torch.linalg.inv(viewmats)
     rotation = _turning(-poses[:, :3, 1].mean(0), viewmats.new_tensor([0.0, -1, 0]))
-    centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
+    centres = poses[:, :3, 3] @ rotation.T
+    forward = poses[:, :3, 2] @ rotation.T
     # quantile(0.5) is numpy's median; torch's takes the lower of two
     focus = (centres - (forward * centres).sum(1, keepdim=True) * forward).quantile(0.5, dim=0)
     distance = float((centres - focus).norm(dim=1).quantile(0.5))
@@ -203,7 +206,8 @@ def _turning(source: Tensor, target: Tensor) -> Tensor:
     """The smallest rotation from one direction to another (Rodrigues); half a turn for opposite
     directions.
     """
-    a, b = F.normalize(source, dim=0), F.normalize(target, dim=0)
+    a = F.normalize(source, dim=0)
+    b = F.normalize(target, dim=0)
     identity = torch.eye(3, dtype=a.dtype)
     cosine = float(a @ b)
     if cosine < -1 + 1e-8:

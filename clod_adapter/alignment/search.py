@@ -159,7 +159,8 @@ def _climb(
     view.
     """
     step, smallest = steps
-    best, trials = score(frame), 0
+    best = score(frame)
+    trials = 0
     while step >= smallest and trials < MOST_TRIALS:
         moves = step * unit * torch.eye(3, dtype=focus.dtype).repeat_interleave(2, 0)
         moves[1::2] *= -1
@@ -169,7 +170,8 @@ def _climb(
         for neighbour in neighbours:
             trials += 1
             if (value := score(neighbour)) > best:
-                best, frame = value, neighbour
+                best = value
+                frame = neighbour
                 break
         else:
             step /= 2

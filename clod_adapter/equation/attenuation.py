@@ -153,7 +153,8 @@ def reach_fade(sigma_d: Tensor, far: Tensor, near: float = 0.0) -> tuple[Tensor,
     fade = 1 - t.square().square()  # as a product, the slope of a small t would cancel
     if near == 0:
         return fade, keep
-    taken_over, is_near = takeover(far, near), sigma_d <= 0
+    taken_over = takeover(far, near)
+    is_near = sigma_d <= 0
     keep = torch.where(is_near, far < near, keep & (taken_over > 0))
     return torch.where(is_near, 1 - taken_over, fade * taken_over), keep
 

@@ -150,7 +150,8 @@ def typical_distance(means: Tensor, places: Sequence[Place], config: Attenuation
         )
     if len(places) == 1:
         return _from(places[0], means, config)
-    logs, places = torch.zeros_like(means[:, 0]), _without_outliers(means, places)
+    logs = torch.zeros_like(means[:, 0])
+    places = _without_outliers(means, places)
     for place in places:
         logs += _from(place, means, config).clamp(min=NEAREST).log()
     return (logs / len(places)).exp()

@@ -15,7 +15,8 @@ import math
 import torch.nn.functional as F
 from torch import Tensor
 
-EPS, TAU = 1e-8, 1 / 255
+EPS = 1e-8
+TAU = 1 / 255
 
 
 def decay(sigma_d: Tensor, far: Tensor) -> Tensor:

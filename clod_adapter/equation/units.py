@@ -28,7 +28,8 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
     use D, all. The result's ``reference_distance`` is ``known_distance`` of the input. Where that
     is unknown and there is a ``growth_d``, it is D: growth begins there.
     """
-    config, sigma = gaussians.attenuation, gaussians.sigma_d
+    config = gaussians.attenuation
+    sigma = gaussians.sigma_d
     if config is None or sigma is None or config.scene_distance == distance:
         return gaussians
     reference = known_distance(config)

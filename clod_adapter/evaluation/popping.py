@@ -69,7 +69,8 @@ def sweep(
     Gaussians of step j.
     """
     require(len(positions) >= 3, "number of positions", len(positions), "at least 3")
-    once, twice = [], []
+    once = []
+    twice = []
     for k in range(1, len(positions)):
         new = show(k, k).clamp(0, 1)
         once.append(_change(new - show(k, k - 1).clamp(0, 1)))
@@ -78,7 +79,9 @@ def sweep(
         tell(progress, Phase.POPPING, k, len(positions) - 1)
     changes, pixels = zip(*once, strict=True)
     wide_changes, wide_pixels = zip(*twice, strict=True)
-    largest, pixel, mean = max(changes), max(pixels), math.fsum(changes) / len(changes)
+    largest = max(changes)
+    pixel = max(pixels)
+    mean = math.fsum(changes) / len(changes)
     return Popping(
         steps=len(changes),
         mean=mean,
@@ -119,7 +122,8 @@ def path_popping(
     progress: Listener | None = None,
 ) -> Popping:
     """Moves through the ``cameras`` in steps of equal length (``path``), at one dial value."""
-    gaussians, views = gaussians.without_empty_bands(), path(cameras, steps)
+    gaussians = gaussians.without_empty_bands()
+    views = path(cameras, steps)
     rasterizer = for_device(gaussians.means.device)
 
     def picture(k: int, j: int) -> Tensor:

@@ -70,7 +70,8 @@ def baseline(
     base: Gaussians, views: Sequence[View], shares: Sequence[float], progress: Listener
 ) -> CellResult:
     """The unadapted base with only its most opaque Gaussians: one row per share."""
-    base, rows = detach(base), list[dict[str, float]]()
+    base = detach(base)
+    rows = list[dict[str, float]]()
     order = base.opacity_logits.argsort(descending=True, stable=True)
 
     def tell_all(now: Progress) -> bool | None:

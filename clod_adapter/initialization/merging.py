@@ -75,7 +75,8 @@ def merge(
             the sum. Without it what nobody sees takes as many of the merged ones as what everybody
             sees: 0.5 dB.
     """
-    mixture, before = mixture_of(gaussians), len(gaussians)
+    mixture = mixture_of(gaussians)
+    before = len(gaussians)
     weights = importance.detach().double().cpu().numpy()
     # of what no view shows, the most similar are merged first
     weights = weights + LEAST * weights.mean()
@@ -83,7 +84,8 @@ def merge(
         groups = _groups(mixture, weights, max(count, int((1 - ROUND) * len(mixture))))
         if groups.max() + 1 == len(mixture):
             break
-        mixture, weights = mixture.merged(groups), np.bincount(groups, weights)
+        mixture = mixture.merged(groups)
+        weights = np.bincount(groups, weights)
         tell(progress, Phase.MERGING, before - len(mixture), before - count)
     return gaussians_of(mixture, gaussians)
 
@@ -135,7 +137,8 @@ def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
     """``[N]`` the number of each one's group: pairs, the cheapest first, until ``count`` groups
     remain, or singles.
     """
-    partner, remaining = np.arange(len(mixture)), len(mixture)
+    partner = np.arange(len(mixture))
+    remaining = len(mixture)
     for first, second in _cheapest(mixture, weights):
         pairs = slice(remaining - count)
         partner[first[pairs]], partner[second[pairs]] = second[pairs], first[pairs]
@@ -154,17 +157,20 @@ def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarra
         weights[i] * weights[j] / np.maximum(weights[i] + weights[j], np.finfo(float).tiny)
     )
     order = np.argsort((_cost(mixture, i, j) + LEAST) * weight, kind="stable")
-    i, j = i[order], j[order]
+    i = i[order]
+    j = j[order]
     free = np.ones(len(mixture), bool)
     while len(i):
-        edges, first = np.arange(len(i)), np.full(len(mixture), len(i))
+        edges = np.arange(len(i))
+        first = np.full(len(mixture), len(i))
         np.minimum.at(first, i, edges)
         np.minimum.at(first, j, edges)
         cheapest = (first[i] == edges) & (first[j] == edges)
         yield i[cheapest], j[cheapest]
         free[i[cheapest]] = free[j[cheapest]] = False
         both_free = free[i] & free[j]
-        i, j = i[both_free], j[both_free]
+        i = i[both_free]
+        j = j[both_free]
 
 
 def _neighbours(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
@@ -172,7 +178,8 @@ def _neighbours(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
     sizes = np.sqrt(mixture.covariances[:, :3].max(1))
     pairs = []
     for rows, _, near in nearest(without_crowds(mixture.means, sizes), NEIGHBOURS):
-        low, high = np.minimum(rows[:, None], near), np.maximum(rows[:, None], near)
+        low = np.minimum(rows[:, None], near)
+        high = np.maximum(rows[:, None], near)
         pairs.append((low * len(mixture) + high)[low < high])
     return np.divmod(np.unique(np.concatenate(pairs)), len(mixture))
 
@@ -181,10 +188,12 @@ def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray
     """Of merging two: the entropy of the merged shape above the mean of both, and the squared
     difference of colours.
     """
-    cost, entropy = np.empty(len(first)), _log_determinants(mixture.covariances.T)
+    cost = np.empty(len(first))
+    entropy = _log_determinants(mixture.covariances.T)
     for start in range(0, len(first), EDGES):
         block = slice(start, start + EDGES)
-        i, j = first[block], second[block]
+        i = first[block]
+        j = second[block]
         p = mixture.mass[i] / (mixture.mass[i] + mixture.mass[j])
         q = 1 - p
         merged = p * mixture.covariances[i].T + q * mixture.covariances[j].T

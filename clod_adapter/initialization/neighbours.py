@@ -9,7 +9,8 @@ from clod_adapter._kernels import threads
 ROWS = 1 << 17  # rows whose neighbours are in memory at a time
 # Gaussians with equal centres, from which on they are displaced, and by which share of their size:
 # a k-d tree cannot split equal points, and compares each with all others.
-CROWD, JITTER = 64, 1e-6
+CROWD = 64
+JITTER = 1e-6
 
 
 def nearest(centres: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -21,7 +22,8 @@ def nearest(centres: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.nd
     """
     from scipy.spatial import cKDTree  # only here: it takes a fifth of a second to import
 
-    tree, neighbours = cKDTree(centres), min(count + 1, len(centres))
+    tree = cKDTree(centres)
+    neighbours = min(count + 1, len(centres))
     for rows in np.array_split(tree.indices, -(-len(centres) // ROWS)):
         yield rows, *tree.query(centres[rows], neighbours, workers=threads.worker_count())
 

@@ -61,9 +61,12 @@ def pruning_order(
     sizes = (
         gaussians.log_scales.detach().double().exp().amax(1).cpu().numpy() if count else np.empty(0)
     )
-    weights, order = importance.detach().double().cpu().numpy().copy(), np.empty(count, np.int64)
+    weights = importance.detach().double().cpu().numpy().copy()
+    order = np.empty(count, np.int64)
     centres = without_crowds(gaussians.means.detach().double().cpu().numpy(), sizes)
-    favoured, remaining, removed_count = np.arange(count), np.arange(count), 0
+    favoured = np.arange(count)
+    remaining = np.arange(count)
+    removed_count = 0
     while len(remaining) > 1:
         substitute, difference = _substitutes(
             centres[remaining], colours[remaining], sizes[remaining]
@@ -100,11 +103,13 @@ def _substitutes(
     centres: np.ndarray, colours: np.ndarray, sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The most similar neighbour of each, and its dissimilarity."""
-    substitute, difference = np.empty(len(centres), np.int64), np.empty(len(centres))
+    substitute = np.empty(len(centres), np.int64)
+    difference = np.empty(len(centres))
     channels = np.ascontiguousarray(colours.T)
     for tree_rows, distances, near in nearest(centres, NEIGHBOURS):
         for at in range(0, len(tree_rows), BLOCK):
-            rows, block = tree_rows[at : at + BLOCK], slice(at, at + BLOCK)
+            rows = tree_rows[at : at + BLOCK]
+            block = slice(at, at + BLOCK)
             substitute[rows], difference[rows] = _most_similar(
                 rows, near[block].T, distances[block].T, channels, sizes
             )
@@ -119,8 +124,10 @@ def _most_similar(
     sizes: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The most similar of the neighbours ``near [K, n]`` of ``rows [n]``, and its dissimilarity."""
-    substitute, least = near[0].copy(), np.full(len(rows), np.inf)
-    colours, size = channels[:, rows], sizes[rows]
+    substitute = near[0].copy()
+    least = np.full(len(rows), np.inf)
+    colours = channels[:, rows]
+    size = sizes[rows]
     with np.errstate(invalid="ignore"):  # inf - inf
         for neighbour, distance in zip(near, np.square(distances), strict=True):
             red, green, blue = np.square(colours - channels[:, neighbour])
@@ -148,7 +155,8 @@ def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor)
     scales = gaussians.log_scales.double().sort(1).values
     area = gaussians.opacities.double() * (scales[:, 1] + scales[:, 2]).exp()
     extinction = gaussians.sigma_d / distances
-    total, weight = torch.zeros_like(area), torch.zeros_like(area)
+    total = torch.zeros_like(area)
+    weight = torch.zeros_like(area)
     for k in range(1, DIALS):
         s = config.max_sv ** (k / (DIALS - 1))
         kept = extinction > s

@@ -75,10 +75,13 @@ def inspect(path: str | Path) -> Inspection:
     if path.suffix.lower() == ".safetensors" and (inspection := _inspect_tensors(path)):
         return inspection
     source = read_source(path)
-    metadata, head, notes = source.metadata, source.head, [*source.notes, *source.metadata.notes]
+    metadata = source.metadata
+    head = source.head
+    notes = [*source.notes, *source.metadata.notes]
     questions = in_question(source.arrays) if source.activation_unknown else {}
     rows = prepared(path, source.arrays, choice_of(questions), metadata.origin, None)
-    values, dial = values_of(rows), None
+    values = values_of(rows)
+    dial = None
     if metadata.attenuation is not None:
         calibration, mismatch = matching_calibration(metadata, values["count"])
         dial = Dial(metadata.attenuation, calibration)
@@ -222,7 +225,8 @@ def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> t
     """Parts that adapting leaves out or does not change, a line each, from the reader's notes and
     changes.
     """
-    lines, used_degree = [], splat.used_sh_degree
+    lines = []
+    used_degree = splat.used_sh_degree
     if gone := splat.total - splat.count:
         lines.append(f"{gone:,} of {splat.total:,} rows, which are not usable")
     lines += [
@@ -253,7 +257,8 @@ def _inspect_tensors(path: Path) -> Inspection | None:
     from clod_adapter.training.state import load_state
 
     metadata = read_tensor_header(path)[1]
-    writer, notes = None, tuple[str, ...]()
+    writer = None
+    notes = tuple[str, ...]()
     about: dict[str, Any]
     if STATE_KEY in metadata:
         description = "the state of an interrupted run, for --resume"
@@ -271,7 +276,8 @@ def _inspect_tensors(path: Path) -> Inspection | None:
     elif f'"{ADAPTER}"' in metadata.get(KEY, ""):
         description = "an adapter: what clod-adapt learned, without its checkpoint"
         adapter = load_adapter(path)
-        writer, notes = f"clod-adapter {adapter.version}", adapter.notes
+        writer = f"clod-adapter {adapter.version}"
+        notes = adapter.notes
         about = {
             "kind": "adapter",
             "writer": writer,

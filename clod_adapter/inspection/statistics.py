@@ -92,7 +92,8 @@ def values_of(prepared: Prepared) -> dict[str, Any]:
         for name, array in prepared.arrays.items()
         if name != "shN"
     }
-    means, logits = columns["means"], columns["opacity_logits"].astype(np.float64)
+    means = columns["means"]
+    logits = columns["opacity_logits"].astype(np.float64)
     with np.errstate(over="ignore"):
         scales = np.sort(np.exp(columns["log_scales"].astype(np.float64)), 0)
         opacities = 1 / (1 + np.exp(-logits))

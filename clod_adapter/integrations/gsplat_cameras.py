@@ -93,13 +93,16 @@ def _one_camera(
     hook = Hook(
         sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten()
     )
-    opacities, means = arguments["opacities"], arguments["means"]
+    opacities = arguments["opacities"]
+    means = arguments["means"]
     attenuated = hook.attenuate(means.reshape(-1, 3), opacities.flatten(), camera)
     drawn_arguments["opacities"] = attenuated.drawn.to(opacities).reshape(opacities.shape)
     if growth_d is not None:
-        name, growth = "scales", attenuated.growth
+        name = "scales"
+        growth = attenuated.growth
         if arguments.get("covars") is not None:
-            name, growth = "covars", growth.square()
+            name = "covars"
+            growth = growth.square()
         sizes = arguments[name]
         further = (1,) * (sizes.dim() - opacities.dim())
         drawn_arguments[name] = sizes * growth.to(sizes).reshape(opacities.shape + further)
@@ -125,7 +128,8 @@ def _cameras(arguments: dict[str, Any], shape: torch.Size) -> Iterator[dict[str,
     if isinstance(arguments.get("rays"), Tensor):  # the only one that gsplat broadcasts
         arguments = {**arguments, "rays": arguments["rays"].expand(*shape, *[-1] * 3)}
     for index in np.ndindex(*shape):
-        batch, camera = index[:-1] or ..., (*index[:-1], slice(index[-1], index[-1] + 1))
+        batch = index[:-1] or ...
+        camera = (*index[:-1], slice(index[-1], index[-1] + 1))
         places = dict.fromkeys(PER_GAUSSIAN, batch) | dict.fromkeys(PER_CAMERA, camera)
         for name, degree in PER_EITHER.items():
             if isinstance(value := arguments.get(name), Tensor):
@@ -157,7 +161,8 @@ def _joined(results: Sequence[Any], shape: torch.Size) -> Any:
 
 def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str, Any]:
     """Rows concatenated, ids offset, what is of an image stacked."""
-    first, images = metas[0], range(len(metas))
+    first = metas[0]
+    images = range(len(metas))
     packed = first.get("gaussian_ids") is not None
     counted: dict[str, Sequence[int]] = {}
     if "depths" in first:

@@ -79,8 +79,10 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
             )
         hook = Hook(sigma_d, config, virtual_scale, growth_d)
         viewmat = settings.viewmatrix.T  # Inria's matrices multiply from the right
-        width, height = settings.image_width, settings.image_height
-        fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
+        width = settings.image_width
+        height = settings.image_height
+        fx = width / (2 * settings.tanfovx)
+        fy = height / (2 * settings.tanfovy)
         K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float32)
         opacities_drawn, keep, growth = hook(means3D, opacities, viewmat, K, width, height)
         # opposite to the viewing direction

@@ -151,7 +151,8 @@ def load(
     """
     path = Path(path)
     source = read_source(path)
-    metadata, dial = source.metadata, SIGMA in source.arrays
+    metadata = source.metadata
+    dial = SIGMA in source.arrays
     values = prepared(
         path,
         source.arrays,
@@ -159,7 +160,9 @@ def load(
         metadata.origin,
         origin,
     )
-    arrays, rows, total = values.arrays, source.rows, len(values.keep)
+    arrays = values.arrays
+    rows = source.rows
+    total = len(values.keep)
     if not values.keep.all():
         arrays = {name: array[values.keep] for name, array in arrays.items()}
         rows = None if rows is None else rows[values.keep]

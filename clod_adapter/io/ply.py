@@ -78,7 +78,8 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
     text = re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]+", _in_ascii, start[: end.end()])
     notes: tuple[str, ...] = ()
     if re.search(_PREFIXED + rb"scale_0\b", text) and b" scale_0" not in text:
-        text, notes = re.sub(_PREFIXED, rb"\g<1>", text), (UNPREFIXED,)
+        text = re.sub(_PREFIXED, rb"\g<1>", text)
+        notes = (UNPREFIXED,)
     header = re.sub(rb"\r\n?", b"\n", text)
     if re.search(rb"[^\t\n\x20-\x7e]", header):
         raise ClodError(

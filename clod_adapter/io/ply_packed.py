@@ -62,8 +62,11 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
     """The attributes of the Gaussians of such a file, of the degree from ``check_packed``."""
     from clod_adapter.gaussians import SH_C0  # here: check_packed needs no torch
 
-    chunks, packed, table = elements["chunk"], elements["vertex"], elements.get("sh")
-    count, bands = len(packed), SH_COUNTS[degree] - 1
+    chunks = elements["chunk"]
+    packed = elements["vertex"]
+    table = elements.get("sh")
+    count = len(packed)
+    bands = SH_COUNTS[degree] - 1
     needed = -(-count // BLOCK)
     if len(chunks) < needed:
         raise ClodError(

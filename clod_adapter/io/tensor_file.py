@@ -70,7 +70,8 @@ def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str,
 
     refuse_known(path, data[:START])
     with refused_if_damaged(path, *_DAMAGED):
-        tensors, head = load(data), data[8 : 8 + int.from_bytes(data[:8], "little")]
+        tensors = load(data)
+        head = data[8 : 8 + int.from_bytes(data[:8], "little")]
         return tensors, json.loads(head).get("__metadata__", {})
 
 

@@ -87,7 +87,8 @@ def prepared(
         origin: what the means are to be relative to; None for ``at``, or what ``origin_of`` finds
             where that is 0.
     """
-    count, coefficients = arrays["means"].shape[:1], arrays["shN"].shape[1:2]
+    count = arrays["means"].shape[:1]
+    coefficients = arrays["shN"].shape[1:2]
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,),
         "quats": (4,),
@@ -181,11 +182,14 @@ def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, floa
     if 2 * np.count_nonzero(opacity > 1) > len(opacity):
         candidates = candidates[1:]
     for name, values, least in candidates:
-        low, high, count = np.inf, -np.inf, 0
+        low = np.inf
+        high = -np.inf
+        count = 0
         for start in range(0, len(values), ROWS):
             block = values[start : start + ROWS]
             block = block[np.isfinite(block).all(1)]
-            low, high = float(block.min(initial=low)), float(block.max(initial=high))
+            low = float(block.min(initial=low))
+            high = float(block.max(initial=high))
             count += len(block)
         if count >= _FEW and low >= least and (low < high or high == 1):
             ranges[name] = low, high

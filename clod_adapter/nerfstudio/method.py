@@ -158,7 +158,8 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
     """
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        others, saved = dict[str, Any](), dict[str, Any]()
+        others = dict[str, Any]()
+        saved = dict[str, Any]()
         for name, value in loaded_state.items():
             state = saved if name.startswith(OWN) else others
             state[name.removeprefix(OWN)] = value
@@ -185,7 +186,8 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
         )
         if exporter is None:
             return
-        plain, compensate = exporter.write_ply, self.model.config.rasterize_mode != "classic"
+        plain = exporter.write_ply
+        compensate = self.model.config.rasterize_mode != "classic"
         adapted = partial(
             write_ply, dial=self.model.dial, screen_filter=ScreenFilter(compensate=compensate)
         )
@@ -214,7 +216,8 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
         dial = self.pipeline.model.dial
         if dial is None:  # before the checkpoint is loaded
             return Optimizers({}, {})
-        steps, final = self.config.max_num_iterations, OURS.lr_final
+        steps = self.config.max_num_iterations
+        final = OURS.lr_final
         optimizers = {
             name: decaying(rate, final * rate, steps) for name, rate in trained_rates(dial).items()
         }
@@ -240,7 +243,8 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
             self.grad_scaler.load_state_dict(state["scalers"])
 
     def _checkpoint(self) -> Path:
-        folder, step = self.config.load_dir, self.config.load_step
+        folder = self.config.load_dir
+        step = self.config.load_step
         if folder is None and self.config.load_checkpoint is None:
             where = (
                 "--load-dir outputs/SCENE/splatfacto/DATE/nerfstudio_models, or a file with"

@@ -33,11 +33,14 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
     """Camera and screen-space filter in the layout of the kernels (``_kernels/conventions.py``)."""
     out = np.empty(conventions.CAMERA, np.float32)
     viewmat, K = (x.detach().cpu().double().numpy() for x in (camera.viewmat, camera.K))
-    fx, fy = float(K[0, 0]), float(K[1, 1])
-    cx, cy = float(K[0, 2]), float(K[1, 2])
+    fx = float(K[0, 0])
+    fy = float(K[1, 1])
+    cx = float(K[0, 2])
+    cy = float(K[1, 2])
     out[:16] = viewmat.reshape(-1)
     out[16:22] = fx, fy, cx, cy, camera.width, camera.height
-    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+    margin_x = 0.15 * camera.width / fx
+    margin_y = 0.15 * camera.height / fy
     out[22:24] = -(cx / fx + margin_x), (camera.width - cx) / fx + margin_x
     out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
     out[26:29] = -viewmat[:3, 3] @ viewmat[:3, :3]
@@ -49,7 +52,8 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
 
 def dial_vector(config: AttenuationConfig, virtual_scale: float) -> np.ndarray:
     """A dial value in the layout of the kernels."""
-    out, rate = np.zeros(dial.DIAL, np.float32), virtual_scale / config.scene_distance
+    out = np.zeros(dial.DIAL, np.float32)
+    rate = virtual_scale / config.scene_distance
     out[dial.RATE2] = min(rate, FASTEST) ** 2
     if config.near_distance > 0:
         out[dial.NEAR2] = min(config.scene_distance / config.near_distance, FASTEST) ** 2
@@ -87,14 +91,17 @@ class Frame:
         )
         threads.run(project, workers, stored, self.drawing, self.packed)
         order = self._depth_order()
-        across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
-        offsets, listing = np.empty(across * down + 1, np.int64), workers_for(len(order))
+        across = -(-camera.width // conventions.TILE)
+        down = -(-camera.height // conventions.TILE)
+        offsets = np.empty(across * down + 1, np.int64)
+        listing = workers_for(len(order))
         histogram = np.zeros((listing, across * down), np.int64)
         totals = np.zeros(listing, np.int64)
         listed = self.packed.records, order, across, histogram, totals
         threads.run(tiles.list_tiles, listing, *listed, *[np.empty(0, np.int32)] * 3)
         total = tiles.tile_offsets(histogram, offsets, totals)
-        self.slots, entries = recycled_array((2 * n,), np.int32), recycled_array((total,), np.int32)
+        self.slots = recycled_array((2 * n,), np.int32)
+        entries = recycled_array((total,), np.int32)
         self.entry_slots = recycled_array((total,), np.int32)
         threads.run(tiles.list_tiles, listing, *listed, self.slots, entries, self.entry_slots)
         self.tiles = Tiles(
@@ -120,7 +127,8 @@ class Frame:
     def blend(self, background: np.ndarray) -> tuple[Tensor, Tensor]:
         """The image and its alpha."""
         size = self.tiles.height, self.tiles.width
-        image, alpha = recycled((*size, 3)), recycled(size)
+        image = recycled((*size, 3))
+        alpha = recycled(size)
         picture = Picture(image.numpy(), alpha.numpy())
         self._run(blend.blend, blend.FORWARD_STATE, background, picture)
         return image, alpha
@@ -164,7 +172,8 @@ class _Picture(torch.autograd.Function):
     ):
         frame = Frame(Stored(*_arrays(inputs)), camera, screen_filter, dial)
         image, alpha = frame.blend(background.detach().contiguous().numpy())
-        ctx.frame, ctx.trained = frame, trained
+        ctx.frame = frame
+        ctx.trained = trained
         ctx.save_for_backward(image, alpha, *inputs)
         return image, alpha
 

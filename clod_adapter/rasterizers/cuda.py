@@ -27,7 +27,8 @@ from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.rasterizers.protocol import drawable, require_float32
 
 TILE = 16
-OLDEST, INSTALL = (1, 4, 0), "pip install gsplat==1.5.3"
+OLDEST = (1, 4, 0)
+INSTALL = "pip install gsplat==1.5.3"
 
 
 @lru_cache(maxsize=1)
@@ -104,13 +105,16 @@ def _project(
     """Inputs of gsplat's tiles and pixels: one row for each Gaussian in the image, in row order."""
     import gsplat
 
-    means, opacities = geometry["means"], geometry["opacities"]
+    means = geometry["means"]
+    opacities = geometry["opacities"]
     # In one transfer to the device.
     tensors = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
     flat = torch.cat([tensor.detach().to(means.dtype) for tensor in tensors]).to(
         means.device, non_blocking=True
     )
-    viewmat, K, eye = flat[:16].view(1, 4, 4), flat[16:25].view(1, 3, 3), flat[25:]
+    viewmat = flat[:16].view(1, 4, 4)
+    K = flat[16:25].view(1, 3, 3)
+    eye = flat[25:]
     projected = _call(
         gsplat.fully_fused_projection,
         means,
@@ -136,7 +140,8 @@ def _project(
     radii, means2d, depths = projected[-5:-2]
     conics, compensations = projected[-2:]
     harmonics = torch.cat([_Rows.apply(rows[ids], x) for x in (sh0, shN)], 1)
-    degree, centres = math.isqrt(harmonics.shape[1]) - 1, _Rows.apply(ids, means)
+    degree = math.isqrt(harmonics.shape[1]) - 1
+    centres = _Rows.apply(ids, means)
     # 1.6.0 finds the directions itself
     if "viewmats" in inspect.signature(gsplat.spherical_harmonics).parameters:
         colors = 0.5 + gsplat.spherical_harmonics(degree, centres, viewmat, harmonics)[0]
@@ -164,8 +169,10 @@ def _blend(projected: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor
     """
     import gsplat
 
-    across, down = -(-camera.width // TILE), -(-camera.height // TILE)
-    depths, means2d = projected["depths"], projected["means2d"]
+    across = -(-camera.width // TILE)
+    down = -(-camera.height // TILE)
+    depths = projected["depths"]
+    means2d = projected["means2d"]
     ids = torch.zeros(len(depths), dtype=torch.int64, device=depths.device)  # all of one image
     _, keys, order = _call(
         gsplat.isect_tiles,

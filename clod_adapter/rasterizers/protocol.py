@@ -80,7 +80,8 @@ class Rasterizer:
         ``seen_from`` is the camera of the dial's distances, where it is another. The first
         ``trained`` rows alone need gradients.
         """
-        attenuated, g = dial(gaussians, seen_from or camera, virtual_scale), gaussians
+        attenuated = dial(gaussians, seen_from or camera, virtual_scale)
+        g = gaussians
         return self.splat(
             g.means,
             g.quats,

@@ -27,14 +27,16 @@ def rasterize(
     screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:
     """See ``clod_adapter.rasterizers.Splat``."""
-    viewmat, K = camera.viewmat.to(means), camera.K.to(means)
+    viewmat = camera.viewmat.to(means)
+    K = camera.K.to(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     rows = ((points[:, 2] >= camera.near) & drawable(quats, opacities)).nonzero()[:, 0]
     rows = rows[points[rows, 2].argsort(stable=True)]
     centres, projected = project(points[rows], quats[rows], scales[rows], viewmat, K, camera)
     covariance, opacities = blurred(projected, opacities[rows], screen_filter)
     colors = shade(means[rows], sh0[rows], shN[rows], camera.position.to(means))
-    x, y = torch.arange(camera.width).to(means) + 0.5, torch.arange(camera.height).to(means) + 0.5
+    x = torch.arange(camera.width).to(means) + 0.5
+    y = torch.arange(camera.height).to(means) + 0.5
     pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 1, 2)
     offsets = pixels - centres
     power = -0.5 * torch.einsum("pni,nij,pnj->pn", offsets, torch.linalg.inv(covariance), offsets)
@@ -56,7 +58,8 @@ def project(
     focal = torch.stack([K[0, 0], K[1, 1]])
     size = torch.tensor([camera.width, camera.height]).to(points)
     margin = 0.15 * size / focal
-    low, high = -K[:2, 2] / focal - margin, (size - K[:2, 2]) / focal + margin
+    low = -K[:2, 2] / focal - margin
+    high = (size - K[:2, 2]) / focal + margin
     ray = torch.minimum(torch.maximum(points[:, :2] / depth[:, None], low), high)
     jacobian = torch.zeros(len(points), 2, 3).to(points)
     jacobian[:, 0, 0], jacobian[:, 1, 1] = focal[0] / depth, focal[1] / depth

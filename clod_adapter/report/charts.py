@@ -55,7 +55,8 @@ MARGINS = (0.75, 0.5, 0.65, 0.1)  # left, bottom, right and top of the axes, inc
 COLUMN, LINE = 2.4, 0.19  # of the legend, inches
 MARKERS = "oDs^vPX"
 ROOM = (38, 11)  # points that a label takes
-FEWEST_TICKS, MOST_TICKS = 3, 9
+FEWEST_TICKS = 3
+MOST_TICKS = 9
 BASE = "base, unadapted"
 
 
@@ -181,7 +182,8 @@ def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
             ]
     _finish(axes, label)
     # Labels of points, without those that would cover another; the first and the last come first.
-    point, placed = axes.figure.dpi / 72, list[Any]()
+    point = axes.figure.dpi / 72
+    placed = list[Any]()
     for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
         x, y = axes.transData.transform(at) / point
         if all(

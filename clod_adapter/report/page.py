@@ -36,7 +36,8 @@ class Picture:
     @property
     def url(self) -> str:
         """The image as WebP in a data: URL, at most WIDEST pixels wide."""
-        image, file = self.image, io.BytesIO()
+        image = self.image
+        file = io.BytesIO()
         picture = Image.fromarray(
             image if image.dtype == np.uint8 else (image.clip(0, 1) * 255).round().astype("u1")
         )
@@ -69,7 +70,9 @@ def write_page(
     """
     import jinja2
 
-    path, against_base, series = Path(path), own_teacher(report), charts.series_of(report)
+    path = Path(path)
+    against_base = own_teacher(report)
+    series = charts.series_of(report)
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
     drawn = [line for line in series if not (against_base and line.label == charts.BASE)]
     draws: dict[str, charts.Draw] = {

@@ -57,7 +57,8 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
 def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, styles: Styles) -> None:
     axes.set_xscale("log")
     for cell in cells:
-        rows, last = [row for row in cell["rows"] if row[key] is not None], cell["max_sv"]
+        rows = [row for row in cell["rows"] if row[key] is not None]
+        last = cell["max_sv"]
         label = f"adapted, s in [1, {last:g}]" if last and last > 1 else "adapted at s = 1 only"
         style = styles[last] | {"marker": "o", "label": label}
         if last is None:
@@ -96,6 +97,7 @@ def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, style
             for ends, share in zip(pairwise(histogram["edges"]), histogram["shares"], strict=True):
                 used += ends if share > 1e-3 else ()
     if used:
-        low, high = math.floor(min(used)), math.ceil(max(used))
+        low = math.floor(min(used))
+        high = math.ceil(max(used))
         axes.set_xlim(low, high)
         axes.set_xticks(range(low, high + 1), [f"{10.0**k:g}" for k in range(low, high + 1)])

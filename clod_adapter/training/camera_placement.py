@@ -40,7 +40,8 @@ BEST = 0.2  # share of the first candidates that are good; later ones must score
 STEP = 0.2
 LOOK = (80, 60)  # size of the renderings that a candidate is scored by
 # a tenth of the Gaussians is at most this many pixels large in the nearest cameras
-SMALL, SMALL_PIXELS = 0.1, 2.0
+SMALL = 0.1
+SMALL_PIXELS = 2.0
 NEARER = 0.15  # of the reach: nearer, on average, no camera looks at the scene
 FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
 VISIBLE = 0.05  # Gaussians of lower opacity are ignored
@@ -111,7 +112,8 @@ class _Placement:
         self.zoom = 0.5 / math.tan(math.radians(field) / 2)  # the focal length in image widths
         # The distance, world units, at which the smallest tenth is at most SMALL_PIXELS pixels
         # large.
-        sizes, means = plain.scales.amax(1)[usable], plain.means[usable]
+        sizes = plain.scales.amax(1)[usable]
+        means = plain.means[usable]
         footprint = _quantile(sizes, SMALL) * WIDTH * self.zoom / SMALL_PIXELS
         from_centre = (means - means.median(0).values).norm(dim=1)
         self.reach = min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
@@ -126,7 +128,8 @@ class _Placement:
 
     def round(self, views: int) -> list[Camera]:
         """Cameras that look at rows not shown yet; raises ClodError if none sees anything."""
-        tries, start = TRIES * views, self.judged
+        tries = TRIES * views
+        start = self.judged
         scored: list[tuple[float, Camera]] = []
 
         def ranked(cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
@@ -143,7 +146,8 @@ class _Placement:
             raise ClodError(
                 "no camera can be placed: the checkpoint is empty from every candidate camera"
             )
-        least, candidates = good[-1][0], ranked(self._beside([camera for _, camera in good], tries))
+        least = good[-1][0]
+        candidates = ranked(self._beside([camera for _, camera in good], tries))
         self.judged += len(scored)
         enough = max(views, sum(value >= least for value, _ in candidates))
         return self._spread([camera for _, camera in candidates[:enough]], views)
@@ -152,7 +156,8 @@ class _Placement:
         """Cameras towards rows, preferably small opaque ones, from uniform directions, at half to
         twice the reach.
         """
-        means, random = self.few.means, partial(torch.rand, generator=self.generator)
+        means = self.few.means
+        random = partial(torch.rand, generator=self.generator)
         # torch.multinomial has a limit of 2^24 weights.
         interest = self.weight * self.hidden / self.few.scales.amax(1).clamp(min=1e-12)
         ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU

@@ -82,11 +82,15 @@ class Dial(nn.Module):
         self._splats = (splats,)
         # Far Gaussians come first: they alone are trained, and their target counts are shares of
         # the near ones' number.
-        self.trained, self.total = len(start), len(start)
-        self.attenuation, self.config = start.attenuation, config.for_views(len(cameras))
+        self.trained = len(start)
+        self.total = len(start)
+        self.attenuation = start.attenuation
+        self.config = config.for_views(len(cameras))
         if start.near is not None:
-            self.schedule, config = FAR, replace(config, start_share=1.0)
-            self.trained, self.total = len(start) - start.whole, start.whole
+            self.schedule = FAR
+            config = replace(config, start_share=1.0)
+            self.trained = len(start) - start.whole
+            self.total = start.whole
         self._counted = config
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
         growth_d = start.growth_d
@@ -100,7 +104,8 @@ class Dial(nn.Module):
         ]
         self.register_buffer("typical", typical, persistent=False)
         self._median_size = float(own_sizes(start.log_scales).median())
-        self.sampler, self._sampled = ViewSampler((), config, self.schedule), 0
+        self.sampler = ViewSampler((), config, self.schedule)
+        self._sampled = 0
 
     @staticmethod
     def sigma_of(parameter: Tensor) -> Tensor:
@@ -246,7 +251,8 @@ class Dial(nn.Module):
         """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, of the
         trained rows.
         """
-        sigma, target = self.sigma_of(parameter), self.target_share(virtual_scale)
+        sigma = self.sigma_of(parameter)
+        target = self.target_share(virtual_scale)
         return count_gradient(self.typical, sigma, virtual_scale, loss, self.config, target)
 
     def target_share(self, virtual_scale: float) -> float:

@@ -48,8 +48,10 @@ class ProcessGroup:
     """
 
     def __init__(self) -> None:
-        self.rank, self.size = dist.get_rank(), dist.get_world_size()
-        self.waiting, self.exchanging = 0.0, 0.0
+        self.rank = dist.get_rank()
+        self.size = dist.get_world_size()
+        self.waiting = 0.0
+        self.exchanging = 0.0
 
     def share(self, work: Sequence[T]) -> Sequence[T]:
         """This process's share of the work: every ``size``-th item, from its rank on."""

@@ -142,7 +142,9 @@ def _initialized(
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     """Steps until the steps or the time budget are used up, or something ends training early."""
-    group, lost, failed = trainer.group, None, None
+    group = trainer.group
+    lost = None
+    failed = None
     began = time.perf_counter() - trainer.seconds
     going = True
     first = trainer.done + 1
@@ -173,13 +175,15 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
                     block.enter_context(stop.listening(in_place_of=signal.default_int_handler))
                 going = tell() and not stop.requests
         except ProcessLost as error:
-            going, lost = False, str(error)
+            going = False
+            lost = str(error)
             tell(lost)
         except LossNotFinite as error:
             if trainer.done == 0:
                 remedy = largest_colour(trainer.gaussians())
                 raise ClodError(f"{error}, so nothing can be learned; {remedy}") from error
-            going, failed = False, str(error)
+            going = False
+            failed = str(error)
             tell(failed)
         trainer.seconds = time.perf_counter() - began
         waited = (group.waiting - before[0], group.exchanging - before[1]) if group else (0.0, 0.0)

@@ -57,7 +57,9 @@ class RowAdam:
         self._units = {
             name: (units or {}).get(name, no_scaling.to(p.device)) for name, p in parameters.items()
         }
-        self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
+        self.beta1 = beta1
+        self.beta2 = beta2
+        self.epsilon = epsilon
         self.moments = dict[str, dict[str, Tensor]]()
         for kind in ("first", "second"):
             self.moments[kind] = {name: torch.zeros_like(p) for name, p in parameters.items()}

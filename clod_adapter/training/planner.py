@@ -55,7 +55,8 @@ def make_plan(
     override = override or Override()
     config = (config or AdaptConfig()).for_views(len(scene.train))
     require_trainable(base, scene, config)
-    views, seconds = usable_views(base, scene.train), dict[str, float]()
+    views = usable_views(base, scene.train)
+    seconds = dict[str, float]()
     with _timed(seconds, "bands"):
         degree, decisions = _sh_degree(base, views, override, progress)
     with _timed(seconds, "start"):
@@ -82,21 +83,24 @@ def _sh_degree(
     base: Gaussians, views: Sequence[View], override: Override, progress: Listener | None
 ) -> tuple[int, list[Decision]]:
     """The SH degree to train with."""
-    highest, views = base.sh_degree, spread(views, VIEWS)
+    highest = base.sh_degree
+    views = spread(views, VIEWS)
     if highest == 0:
         return 0, [Decision("SH degrees", NOT_NEEDED, None, "", "there are none")]
     if "bands" in override.keep:
         return highest, [Decision("SH degrees", "kept", None, "", REQUESTED, "bands")]
     if "bands" in override.leave_out:
         return 0, [Decision("SH degrees", "left out", None, "", REQUESTED, "bands")]
-    degree, decisions = highest, list[Decision]()
+    degree = highest
+    decisions = list[Decision]()
     for band, loss in sh_degree_losses(base, views, LIMIT):
         degrees, pronoun = (
             (f"{band}", "it") if band == highest else (f"{band} to {highest}", "them")
         )
         why = f"change without {pronoun}, {_counted(len(views))}"
         if loss < LIMIT:  # one decision for all that are left out
-            degree, decisions = band - 1, []
+            degree = band - 1
+            decisions = []
         verdict = "left out" if loss < LIMIT else "kept"
         decisions.append(Decision(f"SH degree {degrees}", verdict, loss, "dB", why, "bands"))
         tell(progress, Phase.SH_DEGREES, highest - band + 1, highest)

@@ -29,11 +29,14 @@ WIDER = 2.0
 TEST_EVERY = 8  # as with photographs
 # Standard deviations of the random offset of a camera, of its distance to the scene, and of its
 # direction, radians; and the largest change of log focal length.
-MOVED, TURNED, ZOOMED = 0.1, 0.05, 0.15
+MOVED = 0.1
+TURNED = 0.05
+ZOOMED = 0.15
 # Without photographs a share BACKED of the moved cameras also steps back, log-uniformly up to
 # FARTHER reaches from the scene: a dial that was learned near the scene only loses what is small in
 # the distance.
-BACKED, FARTHER = 1 / 3, 4.0
+BACKED = 1 / 3
+FARTHER = 4.0
 
 
 class PseudoView(StoredView):

@@ -78,7 +78,9 @@ class ViewSampler:
     def __init__(
         self, views: tuple[View, ...], config: AdaptConfig, schedule: Schedule = OURS
     ) -> None:
-        self.views, self.max_sv, self.schedule = views, config.max_sv, schedule
+        self.views = views
+        self.max_sv = config.max_sv
+        self.schedule = schedule
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
         self.offset = self.random.random()

@@ -168,7 +168,8 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
         about = json.loads(metadata[KEY])
         belongs = dict(about.pop("belongs"))
         attenuation = AttenuationConfig(**about.pop("attenuation"))
-        random, order = dict(about.pop("random")), tuple(map(int, about.pop("order")))
+        random = dict(about.pop("random"))
+        order = tuple(map(int, about.pop("order")))
         counts: Any = {
             name: (int if name in ("averaged", "steps") else float)(n) for name, n in about.items()
         }

@@ -69,9 +69,11 @@ def count_gradient(
     from clod_adapter.rasterizers.cpu import workers_for
 
     out = torch.empty_like(sigma_d, memory_format=torch.contiguous_format)
-    n, workers = len(out), workers_for(len(out))
+    n = len(out)
+    workers = workers_for(len(out))
     arrays = [x.detach().contiguous().numpy() for x in (sigma_d, distances)]
-    square, counts = virtual_scale**2, np.zeros(workers, np.int64)
+    square = virtual_scale**2
+    counts = np.zeros(workers, np.int64)
     threads.run(count.count_kept, workers, *arrays, square, counts)
     penalty = float(_penalty(float(counts.sum()) / n, target, loss, config))
     scale = LIFT if penalty < 0 else 0.0, SHARPNESS * penalty / n

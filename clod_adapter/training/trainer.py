@@ -33,7 +33,8 @@ from clod_adapter.training.state import TrainingState
 # Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its
 # square root, so that each view has the same effect (Zhao et al., "On Scaling Up 3D Gaussian
 # Splatting Training", ICLR 2025).
-BETA1, BETA2 = 0.9, 0.999
+BETA1 = 0.9
+BETA2 = 0.999
 
 
 class Trainer:
@@ -66,7 +67,8 @@ class Trainer:
         self.order: Tensor | None = None
         if start.near is not None:
             far_first = start.near.int().argsort(stable=True)
-            self.order, start = far_first.argsort(), start.select(far_first)
+            self.order = far_first.argsort()
+            start = start.select(far_first)
         form = form_of(config)
         self.rates = learning_rates(config, form.decay)
         # A frozen attribute requests no gradient from the rasterizer.
@@ -85,8 +87,11 @@ class Trainer:
         splats = Gaussians(**attributes, screen_filter=start.screen_filter)
         self.dial = form(splats, start, [view.camera for view in views], config)
         dials = {name: value.detach() for name, value in self.dial.named_parameters()}
-        self.parameters, self.stepped = attributes | dials, (*tuned, *dials)
-        self.config, self.group, self.count = config, group, self.dial.trained
+        self.parameters = attributes | dials
+        self.stepped = (*tuned, *dials)
+        self.config = config
+        self.group = group
+        self.count = self.dial.trained
         self.sampler = ViewSampler(views, config, self.dial.schedule)
         self.screen_filter = start.screen_filter
         # The count term has a gradient of culled Gaussians too.
@@ -94,7 +99,8 @@ class Trainer:
         parameters_by_rows = {"kept": dict[str, Tensor](), "all": {}}
         for name, value in self.trained().items():
             parameters_by_rows["all" if name in everywhere else "kept"][name] = value
-        beta1, beta2 = BETA1**config.batch, BETA2**config.batch
+        beta1 = BETA1**config.batch
+        beta2 = BETA2**config.batch
         units = {"means": own_sizes(start.log_scales[: self.count])}
         self.optimizers = {
             rows: RowAdam(parameters, beta1=beta1, beta2=beta2, units=units)
@@ -179,7 +185,8 @@ class Trainer:
             name: gradient[first]
             for name, gradient in zip(self.stepped, stepped_gradients, strict=True)
         }
-        unweighted, decay = loss.detach().double(), self.dial.decay
+        unweighted = loss.detach().double()
+        decay = self.dial.decay
         parameter = self.parameters[decay][first]
         for counted_dial, weighted in self.dial.counts(s, counted, unweighted):
             gradients[decay] = gradients[decay] + self.dial.count_gradient(

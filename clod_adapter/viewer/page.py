@@ -41,16 +41,20 @@ from clod_adapter.rasterizers.reference import rotations
 from clod_adapter.render import render
 
 BLOCK_ROWS = 1 << 14
-STYLE, SCRIPT = "viewer.css", "viewer.js"
+STYLE = "viewer.css"
+SCRIPT = "viewer.js"
 ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
 # of the picture shown while the page loads: pixels, and of JPEG
-POSTER_SIDE, POSTER_QUALITY = 512, 60
+POSTER_SIDE = 512
+POSTER_QUALITY = 60
 # of up_axis, as in web/src/model.js: first guesses; least logarithm between a flat Gaussian's least
 # two scales; cosine within which it faces the axis; share of the flat ones that do; steps
 UPS = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
-FLAT, BESIDE = math.log(2), math.cos(math.pi / 5)
-SURE, UP_STEPS = 0.3, 10
+FLAT = math.log(2)
+BESIDE = math.cos(math.pi / 5)
+SURE = 0.3
+UP_STEPS = 10
 MAX_PITCH = 0.995  # cosine of a camera's axis and up, beyond which it is not levelled
 
 Entry = Mapping[str, Any]
@@ -98,7 +102,8 @@ class Payload:
 
         A logit above 20 is written as 20, the same opacity in float32.
         """
-        g, tensors = self.gaussians, self.gaussians.tensors()
+        g = self.gaussians
+        tensors = self.gaussians.tensors()
         columns = [
             g.means,
             g.sh0,
@@ -208,11 +213,9 @@ def write_viewer_page(
     config = page_config([{"name": payload.name, "element": ELEMENT}], None, entries, virtual_scale)
     with atomic_path(path) as temporary:
         if exact:
-            data, gaussians, notes = (
-                b"".join(payload.blocks()),
-                payload.gaussians,
-                tuple[str, ...](),
-            )
+            data = b"".join(payload.blocks())
+            gaussians = payload.gaussians
+            notes = tuple[str, ...]()
         else:
             data, gaussians, notes = payload.packed(f"{temporary}.spz")
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
@@ -253,14 +256,16 @@ def levelled(camera: Camera, axis: np.ndarray) -> Camera:
 def up_axis(gaussians: Gaussians) -> np.ndarray:
     """The direction that flat Gaussians face, a ground or a table, as in web/src/model.js."""
     g = gaussians.to("cpu")
-    means, scales = g.means.double().numpy(), np.sort(g.log_scales.numpy(), axis=1)
+    means = g.means.double().numpy()
+    scales = np.sort(g.log_scales.numpy(), axis=1)
     offsets = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     flat = (scales[:, 0] + FLAT < scales[:, 1]) & (offsets <= np.quantile(offsets, 0.98))
     if not flat.any():
         return np.array(UPS[0])
     axes = rotations(g.quats[torch.from_numpy(flat)].double()).numpy()
     thin = g.log_scales.numpy()[flat].argmin(axis=1)
-    normals, weights = axes[np.arange(len(axes)), :, thin], g.opacities.double().numpy()[flat]
+    normals = axes[np.arange(len(axes)), :, thin]
+    weights = g.opacities.double().numpy()[flat]
     for up in np.array(UPS):
         for _ in range(UP_STEPS):
             cosines = normals @ up

@@ -84,7 +84,8 @@ class Server(ThreadingHTTPServer):
 
     def server_bind(self) -> None:
         socketserver.TCPServer.server_bind(self)  # HTTPServer's looks up the host name
-        self.server_name, self.server_port = HOST, self.port
+        self.server_name = HOST
+        self.server_port = self.port
 
     def get_request(self) -> tuple[socket.socket, Any]:
         request, address = super().get_request()
@@ -112,7 +113,8 @@ class Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
-    server_version, sys_version = "clod-adapt", ""
+    server_version = "clod-adapt"
+    sys_version = ""
     timeout = IDLE_TIMEOUT
     server: Server
 

@@ -35,7 +35,8 @@ DEGREE = 3  # the highest that the extension has
 # about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]
 _LIMIT = 1 << 32  # bytes of a file, whose header says how many in 32 bits
-_FLOAT, _BYTE = 5126, 5121
+_FLOAT = 5126
+_BYTE = 5121
 
 
 def harmonics(degree: int) -> list[str]:
@@ -48,7 +49,8 @@ def harmonics(degree: int) -> list[str]:
     return names
 
 
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
+_JSON = 0x4E4F534A
+_BIN = 0x004E4942
 # Component types: those that the extension allows in the place of floats, whose largest value
 # stands for 1, and these.
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}

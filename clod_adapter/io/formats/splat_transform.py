@@ -33,7 +33,8 @@ _PATH = "PATH=FOLDER/node_modules/node/bin:FOLDER/node_modules/.bin:$PATH"
 HELP = f"in a folder of its own: {INSTALL}; then {_PATH}, or the command in {VARIABLE}"
 ASKING = 30.0  # seconds that a question about itself may take
 # seconds after which a run has hung, and per Gaussian; ten times what was measured
-LIMIT, LIMIT_EACH = 600.0, 0.02
+LIMIT = 600.0
+LIMIT_EACH = 0.02
 LIMIT_CONVERT = 1800.0  # seconds; five million Gaussians take about a minute
 TICK = 0.2  # seconds between two checks for its end
 # Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its
@@ -47,7 +48,8 @@ _TEXT: dict[str, Any] = {
     "errors": "replace",
 }
 # fewest leaves of a large set, and thousands (1,024) of Gaussians below which none is cut
-LEAVES, SMALLEST = 128, 8
+LEAVES = 128
+SMALLEST = 8
 
 
 def cutting_options(count: int) -> tuple[str, ...]:

@@ -53,13 +53,15 @@ from clod_adapter.io.values import (
 )
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
-MAGIC, VERSION = 0x5053474E, 3
+MAGIC = 0x5053474E
+VERSION = 3
 RECORD = 0x434C0001  # vendor "CL", its first extension
 COLUMNS = "columns"  # of the record, in the document
 AXES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 RDF = 6  # right, down, forward
 # flags: of a filter that compensates opacities, of records after the arrays
-ANTIALIASED, EXTENDED = 1, 2
+ANTIALIASED = 1
+EXTENDED = 2
 MOST = 10_000_000  # Gaussians that the reference reads
 DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0
@@ -282,7 +284,8 @@ def _records(data: bytes) -> dict[int, bytes]:
 def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The JSON document of our record, and the columns of the dial if they are there."""
     length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
-    text, halves = body[4 : 4 + length], body[4 + length :]
+    text = body[4 : 4 + length]
+    halves = body[4 + length :]
     with refused_if_damaged(path, *DAMAGED):
         stored = json.loads(text)
         names = stored.get(COLUMNS, [SIGMA])

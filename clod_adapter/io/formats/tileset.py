@@ -144,5 +144,6 @@ def _box(centres: Sequence[np.ndarray], rows: Rows, origin: Origin) -> list[floa
     points = np.concatenate([centre[level] for centre, level in zip(centres, rows, strict=True)])
     ends = np.quantile(points, [STRAY / 2, 1 - STRAY / 2], 0) + np.array(origin)
     turned = -ends[::-1, [0, 2, 1]]
-    centre, half = turned.mean(0), (turned[1] - turned[0]) / 2
+    centre = turned.mean(0)
+    half = (turned[1] - turned[0]) / 2
     return [*centre.tolist(), *np.diag(half).ravel().tolist()]

@@ -155,7 +155,8 @@ def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.
     """``[M, 3]`` float64, the points of the scene's COLMAP model less ``origin``; none without a
     model.
     """
-    model, points = find_cameras(Path(folder)), list[Sequence[float]]()
+    model = find_cameras(Path(folder))
+    points = list[Sequence[float]]()
     path = next((file for form in FORMS if (file := model / f"points3D{form}").is_file()), None)
     if path is not None:
         with refused_if_damaged(path, DAMAGED):
@@ -190,7 +191,8 @@ class _Records:
         return values
 
     def take_name(self) -> str:
-        start, end = self.at, self.data.index(b"\0", self.at)
+        start = self.at
+        end = self.data.index(b"\0", self.at)
         self.at = end + 1
         return self.data[start:end].decode("utf-8", "surrogateescape")
 

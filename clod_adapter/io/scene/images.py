@@ -176,7 +176,8 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
     """
     if cache is None or image.is_pinhole:
         return _made(image, path, max_width)
-    state, camera = path.stat(), image.camera
+    state = path.stat()
+    camera = image.camera
     ingredients = (
         str(path.resolve()),
         state.st_size,
