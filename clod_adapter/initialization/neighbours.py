@@ -7,10 +7,9 @@ import numpy as np
 from clod_adapter._kernels import threads
 
 ROWS = 1 << 17  # rows whose neighbours are in memory at a time
-# Gaussians with equal centres, from which on they are displaced, and by which share of their size:
-# a k-d tree cannot split equal points, and compares each with all others.
-CROWD = 64
-JITTER = 1e-6
+# A k-d tree cannot split equal points, and compares each with all others.
+CROWD = 64  # Gaussians with equal centres, from which on they are displaced
+JITTER = 1e-6  # largest displacement, a share of their size
 
 
 def nearest(centres: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

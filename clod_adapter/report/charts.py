@@ -50,9 +50,11 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # keeps text as text in a page
 }
 Draw = Callable[[Any], None]  # of the axes of an empty figure
-SIZE, NARROW = (7.2, 4.1), (4.0, 4.0)  # inches, without the legend; NARROW for phones
+SIZE = (7.2, 4.1)  # inches, without the legend
+NARROW = (4.0, 4.0)  # likewise, for phones
 MARGINS = (0.75, 0.5, 0.65, 0.1)  # left, bottom, right and top of the axes, inches
-COLUMN, LINE = 2.4, 0.19  # of the legend, inches
+COLUMN = 2.4  # width of a column of the legend, inches
+LINE = 0.19  # height of a line of the legend, inches
 MARKERS = "oDs^vPX"
 ROOM = (38, 11)  # points that a label takes
 FEWEST_TICKS = 3

@@ -30,18 +30,20 @@ from clod_adapter.initialization.importance import coverage
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
-VIEWS, MOST = 96, 384  # cameras of a round, and of all rounds
-SHOWN, COVERED = 0.99, 0.5  # share of the Gaussians to show, each with that many pixels
-WIDTH, HEIGHT = 496, 368  # of the images; sizes in pixels refer to the width
+VIEWS = 96  # cameras of a round
+MOST = 384  # cameras of all rounds
+SHOWN = 0.99  # share of the Gaussians to show
+COVERED = 0.5  # pixels with which a Gaussian is shown
+WIDTH = 496  # of the images; sizes in pixels refer to it
+HEIGHT = 368
 FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
 TRIES = 3  # candidates for each view, first anywhere, then as many near the best of those
 BEST = 0.2  # share of the first candidates that are good; later ones must score as high
 # standard deviation of the offset from a good camera, of the reach, and of its unit direction
 STEP = 0.2
 LOOK = (80, 60)  # size of the renderings that a candidate is scored by
-# a tenth of the Gaussians is at most this many pixels large in the nearest cameras
-SMALL = 0.1
-SMALL_PIXELS = 2.0
+SMALL = 0.1  # share of the Gaussians that are small
+SMALL_PIXELS = 2.0  # largest size of these in the nearest cameras
 NEARER = 0.15  # of the reach: nearer, on average, no camera looks at the scene
 FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
 VISIBLE = 0.05  # Gaussians of lower opacity are ignored

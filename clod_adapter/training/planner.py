@@ -27,7 +27,8 @@ LIMIT = 0.02
 VIEWS = 8  # evenly spread training views on which that is measured
 REQUESTED = "as requested, not measured"
 FEW = 0.02  # share of the Gaussians that the farthest views and the smallest budgets have
-FARTHER, FARTHEST = 1.1, 100.0  # step and end of the search for the dial value with that share
+FARTHER = 1.1  # step of the search for the dial value with that share
+FARTHEST = 100.0  # end of that search
 
 
 @torch.inference_mode(False)

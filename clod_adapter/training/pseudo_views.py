@@ -27,11 +27,9 @@ ADDED = 96
 NEAR = 4
 WIDER = 2.0
 TEST_EVERY = 8  # as with photographs
-# Standard deviations of the random offset of a camera, of its distance to the scene, and of its
-# direction, radians; and the largest change of log focal length.
-MOVED = 0.1
-TURNED = 0.05
-ZOOMED = 0.15
+MOVED = 0.1  # standard deviation of a camera's random offset, of its distance to the scene
+TURNED = 0.05  # standard deviation of its direction, radians
+ZOOMED = 0.15  # largest change of the logarithm of its focal length
 # Without photographs a share BACKED of the moved cameras also steps back, log-uniformly up to
 # FARTHER reaches from the scene: a dial that was learned near the scene only loses what is small in
 # the distance.

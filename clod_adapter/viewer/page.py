@@ -45,15 +45,13 @@ STYLE = "viewer.css"
 SCRIPT = "viewer.js"
 ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
-# of the picture shown while the page loads: pixels, and of JPEG
-POSTER_SIDE = 512
-POSTER_QUALITY = 60
-# of up_axis, as in web/src/model.js: first guesses; least logarithm between a flat Gaussian's least
-# two scales; cosine within which it faces the axis; share of the flat ones that do; steps
-UPS = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
-FLAT = math.log(2)
-BESIDE = math.cos(math.pi / 5)
-SURE = 0.3
+POSTER_SIDE = 512  # pixels of the picture shown while the page loads
+POSTER_QUALITY = 60  # of its JPEG
+# Settings of up_axis, as in web/src/model.js.
+UPS = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))  # first guesses
+FLAT = math.log(2)  # least logarithm of the ratio of a flat Gaussian's least two scales
+BESIDE = math.cos(math.pi / 5)  # cosine within which a flat Gaussian faces the axis
+SURE = 0.3  # least share of the flat Gaussians that do
 UP_STEPS = 10
 MAX_PITCH = 0.995  # cosine of a camera's axis and up, beyond which it is not levelled
 

@@ -32,9 +32,9 @@ INSTALL = "npm install node@22 @playcanvas/splat-transform@3.7"
 _PATH = "PATH=FOLDER/node_modules/node/bin:FOLDER/node_modules/.bin:$PATH"
 HELP = f"in a folder of its own: {INSTALL}; then {_PATH}, or the command in {VARIABLE}"
 ASKING = 30.0  # seconds that a question about itself may take
-# seconds after which a run has hung, and per Gaussian; ten times what was measured
-LIMIT = 600.0
-LIMIT_EACH = 0.02
+# Ten times what was measured.
+LIMIT = 600.0  # seconds after which a run has hung
+LIMIT_EACH = 0.02  # seconds more for each Gaussian
 LIMIT_CONVERT = 1800.0  # seconds; five million Gaussians take about a minute
 TICK = 0.2  # seconds between two checks for its end
 # Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its
@@ -47,9 +47,8 @@ _TEXT: dict[str, Any] = {
     "encoding": "utf-8",
     "errors": "replace",
 }
-# fewest leaves of a large set, and thousands (1,024) of Gaussians below which none is cut
-LEAVES = 128
-SMALLEST = 8
+LEAVES = 128  # fewest of a large set
+SMALLEST = 8  # thousands (1,024) of Gaussians below which a leaf is not cut
 
 
 def cutting_options(count: int) -> tuple[str, ...]:

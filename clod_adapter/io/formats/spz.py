@@ -59,9 +59,8 @@ RECORD = 0x434C0001  # vendor "CL", its first extension
 COLUMNS = "columns"  # of the record, in the document
 AXES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 RDF = 6  # right, down, forward
-# flags: of a filter that compensates opacities, of records after the arrays
-ANTIALIASED = 1
-EXTENDED = 2
+ANTIALIASED = 1  # flag of a filter that compensates opacities
+EXTENDED = 2  # flag of records after the arrays
 MOST = 10_000_000  # Gaussians that the reference reads
 DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0

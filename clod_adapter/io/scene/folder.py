@@ -36,7 +36,8 @@ UNUSED = (
 )
 MISSING = 0.5  # the share of photographs that may be missing
 MOST_PARTS = 8  # of the end of a path from another machine
-LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of its parts
+LONGEST_NAME = 4000  # characters of a path
+LONGEST_PART = 255  # bytes of one of its parts
 
 
 def find_cameras(folder: Path) -> Path:

@@ -48,7 +48,10 @@ REDUCED = f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: r
 Turn = Image.Transpose
 # EXIF orientations that swap the sides
 _TURNS = {5: Turn.TRANSPOSE, 6: Turn.ROTATE_270, 7: Turn.TRANSVERSE, 8: Turn.ROTATE_90}
-_ORIENTATION, _BITS, _PLANES = 0x0112, 258, 284  # tags of EXIF and TIFF
+# Tags of EXIF and TIFF.
+_ORIENTATION = 0x0112
+_BITS = 258
+_PLANES = 284
 SCALED = "scaled {} (Pillow bicubic, as in Inria's code)"
 _ONE_LARGE = threading.Lock()  # of more than LARGE pixels one at a time
 _KEY = "clod-adapter"  # of the text in a cached PNG
