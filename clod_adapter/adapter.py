@@ -113,7 +113,7 @@ class Adapter:
 
     @property
     def base_count(self) -> int:
-        """How many Gaussians the base has."""
+        """The number of Gaussians of the base."""
         return len(self.sigma_d) - (len(self.added["means"]) if self.added else 0)
 
     def apply(self, base: Gaussians, fingerprint: str | None = None) -> Gaussians:
@@ -180,7 +180,7 @@ def extract(
     config: dict[str, Any],
     origin: Origin = NOWHERE,
 ) -> Adapter:
-    """What has to be added to ``base`` to get ``adapted``, rounded to float16 differences.
+    """The adapter that makes ``adapted`` of ``base``, with differences rounded to float16.
 
     sigma_d is taken in world units. Attributes with identical values are left out. Where the
     differences do not fit float16 (one overflows, all are tiny, or an infinite logit became finite)

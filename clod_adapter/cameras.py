@@ -280,5 +280,5 @@ def in_its_unit(scene: Scene) -> Scene:
 
 
 def spread(views: Sequence[T], most: int) -> Sequence[T]:
-    """At most ``most`` of the views, evenly spread."""
+    """Evenly spread views, at most ``most``."""
     return [views[k * len(views) // most] for k in range(most)] if len(views) > most else views

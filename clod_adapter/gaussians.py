@@ -113,7 +113,7 @@ class Gaussians:
 
     @property
     def whole(self) -> int:
-        """How many are drawn at s = 0: all, or the near ones. Shares of what is kept are shares of
+        """The number drawn at s = 0: all, or the near ones. Shares of what is kept are shares of
         these.
         """
         return len(self) if self.near is None else int(self.near.sum())

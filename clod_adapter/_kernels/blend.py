@@ -129,7 +129,7 @@ def spread(records, r, ox, oy):
 
 
 class Meeting(NamedTuple):
-    """What a Gaussian does to the pixels of a block."""
+    """Effect of a Gaussian on the pixels of a block."""
 
     dx: Any  # offsets of the pixels from the centre
     dy: Any

@@ -97,7 +97,7 @@ class Stored(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """How Gaussians are drawn."""
+    """Settings by which Gaussians are drawn."""
 
     cam: Any  # a camera, as above
     dial: Any  # as in ``dial.py``

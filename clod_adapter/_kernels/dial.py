@@ -46,7 +46,7 @@ NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
 @part
 def squared_distance(w, cam):
-    """From the camera's centre to the centres ``w[:3]``, world units^2."""
+    """Squared distances from the camera to the centres ``w[:3]``, world units^2."""
     dx, dy, dz = w[0] - cam[EYE], w[1] - cam[EYE + 1], w[2] - cam[EYE + 2]
     return dx * dx + dy * dy + dz * dz
 
@@ -66,7 +66,7 @@ def takeover(far2, near2):
 
 @part
 def survives(sigma, far2, near2):
-    """Which of sixteen rows the dial keeps."""
+    """A mask of the rows, of sixteen, that the dial keeps."""
     end2 = squared_reach(sigma, far2)
     if near2 > 0:
         far = gt(sigma, 0)

@@ -72,8 +72,8 @@ def log2(builder, x):
 
 @operation(types.none, types.CPointer(types.uint64), types.int64, f32x16, f32x16)
 def set_spans(builder, words, index, low, high):
-    """In the r-th of sixteen groups of sixteen bits from ``words[index]`` on, sets bits low[r] to
-    high[r].
+    """Sets bits low[r] to high[r] in the r-th of sixteen groups of sixteen bits from
+    ``words[index]`` on.
 
     Both are rounded towards zero; where high < low no bit is set.
     """

@@ -180,7 +180,7 @@ def _transposed(builder, rows):
 
 
 def _addresses(builder, table, rows, width, first):
-    """Of the columns of sixteen rows, from ``first`` on."""
+    """Addresses of the columns of sixteen rows, from ``first`` on."""
     numbers = [builder.load(builder.gep(rows, [ir.Constant(I32, lane)])) for lane in range(LANES)]
     return [_vector_at(builder, table, builder.mul(row, width), first) for row in numbers]
 
@@ -216,8 +216,8 @@ def store_rows(builder, destination, rows, width, first, count, lanes, at):
 
 @operation(types.none, VECTORS)
 def _split_triples(builder, lanes):
-    """Of sixteen triples in three vectors, makes vectors of the first, the second and the third
-    ones.
+    """Makes vectors of the first, the second and the third numbers of sixteen triples in three
+    vectors.
     """
     addresses = _lanes(builder, lanes, ir.Constant(I64, 0), 3)
     a, b, c = (builder.load(x, align=4) for x in addresses)

@@ -70,8 +70,8 @@ def align(
 def compare_frames(
     checkpoint: Checkpoint, scene: Scene, note: Note, cameras: Sequence[Camera] = ()
 ) -> tuple[Alignment, Guess | None]:
-    """How renders match the photographs, and after a poor match another frame that explains them
-    better.
+    """Compares renders with the photographs, and after a poor match finds a frame that explains
+    them better.
 
     ``cameras`` are all of the scene's, if its photographs are not.
     """

@@ -72,7 +72,7 @@ TAKEOVER = 5.0  # far Gaussians begin at sqrt(1 - 1/5) H
 
 
 class Attenuated(NamedTuple):
-    """What is drawn at one dial value.
+    """Opacities, culling and growth at one dial value.
 
     Attributes:
         drawn: ``[N]`` opacities ``a f``, the rasterizer's input, in [0, 1]; 0 where the Gaussian is
@@ -96,7 +96,7 @@ def attenuate(
     activated: bool = False,
     growth_d: Tensor | None = None,
 ) -> Attenuated:
-    """What is drawn of Gaussians at one dial value. Rendering, training, baking and renderers'
+    """Attenuates Gaussians for one dial value. Rendering, training, baking and renderers'
     hooks all call this.
 
     Differentiable in ``opacities``, ``sigma_d`` and ``growth_d``, not in distances. Without a

@@ -42,7 +42,7 @@ from clod_adapter.render import render
 
 @dataclass(frozen=True)
 class Popping:
-    """How the image changes over a sweep, in steps of equal length; changes are in levels of 255.
+    """Changes of the image over a sweep, in steps of equal length; changes are in levels of 255.
 
     ``mean`` and ``largest`` are changes of a step, ``at`` the end of the largest one, as a dial
     value or a share of the camera path; ``pixel`` is the largest change of one channel of one

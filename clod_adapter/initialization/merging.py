@@ -106,7 +106,7 @@ def mixture_of(gaussians: Gaussians) -> Mixture:
 
 
 def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
-    """With the screen filter and the SH degree of ``like``."""
+    """The Gaussians of a mixture, with the screen filter and the SH degree of ``like``."""
     full = np.empty((len(mixture), 3, 3))
     for (i, j), column in zip(_ENTRIES, mixture.covariances.T, strict=True):
         full[:, i, j] = full[:, j, i] = column
@@ -185,8 +185,8 @@ def _neighbours(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Of merging two: the entropy of the merged shape above the mean of both, and the squared
-    difference of colours.
+    """The cost of merging two: the entropy of the merged shape above the mean of both, and the
+    squared difference of colours.
     """
     cost = np.empty(len(first))
     entropy = _log_determinants(mixture.covariances.T)
@@ -211,7 +211,7 @@ def _products(vectors: np.ndarray) -> np.ndarray:
 
 
 def _log_determinants(covariances: np.ndarray) -> np.ndarray:
-    """``[N]`` of covariances ``[6, N]``."""
+    """``[N]`` logarithms of the determinants of covariances ``[6, N]``."""
     xx, yy, zz = covariances[:3] + THINNEST
     xy, xz, yz = covariances[3:]
     determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
@@ -219,7 +219,7 @@ def _log_determinants(covariances: np.ndarray) -> np.ndarray:
 
 
 def _areas(scales: np.ndarray) -> np.ndarray:
-    """``[N]`` of ellipsoids, over 4 pi."""
+    """``[N]`` areas of ellipsoids, over 4 pi."""
     x, y, z = scales.T
     sides = np.stack([x * y, x * z, y * z])
     return np.mean(sides**THOMSEN, 0) ** (1 / THOMSEN)

@@ -13,8 +13,8 @@ JITTER = 1e-6  # largest displacement, a share of their size
 
 
 def nearest(centres: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Some rows ``[n]``, and ``[n, K]`` the distances and the rows of the ``count`` nearest, after
-    their own.
+    """Blocks of rows ``[n]``, and ``[n, K]`` the distances and the rows of the ``count`` nearest,
+    after their own.
 
     In the tree's order, in which successive rows are neighbours: a third of the time for a file in
     random order. There are fewer than ``count`` where there are no more.

@@ -29,8 +29,8 @@ SHARE = 0.65  # of the fitted exponents that is used; 0.5 and 0.8 are no better 
 
 
 class PruningOrder(NamedTuple):
-    """How many Gaussians are removed before each, and the similar one, removed later, that took its
-    importance.
+    """The number of Gaussians removed before each, and the similar one, removed later, that took
+    its importance.
 
     Both are ``[N]`` int64. The last one's substitute is itself.
     """

@@ -178,8 +178,8 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
         )
 
     def _export_with_dial(self) -> None:
-        """In ns-export, whose commands no plugin can add to: the function that writes the PLY's
-        rows.
+        """Replaces the function of ns-export, to which no plugin can add commands, that writes the
+        PLY's rows.
         """
         exporter = getattr(
             sys.modules.get(EXPORTER) or sys.modules["__main__"], "ExportGaussianSplat", None
@@ -224,8 +224,8 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
         return Optimizers(self.config.optimizers | optimizers, self.pipeline.get_param_groups())
 
     def _load_checkpoint(self) -> None:
-        """Of splatfacto: its Gaussians, for a new dial from step 0. Of this method: everything,
-        from the next step.
+        """Loads splatfacto's Gaussians, for a new dial from step 0, or everything of this method's
+        checkpoint, from the next step.
         """
         if torch.__version__ < "2.6":
             raise ClodError(

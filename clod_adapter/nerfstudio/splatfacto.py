@@ -45,8 +45,8 @@ def camera_of(camera: Any) -> Camera:
 def shown(
     parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_scale: float
 ) -> dict[str, Tensor]:
-    """What splatfacto is to draw in place of its ``means``, ``scales`` and ``opacities`` for a
-    camera and dial value.
+    """Tensors that splatfacto is to draw in place of its ``means``, ``scales`` and ``opacities``
+    for a camera and dial value.
 
     Scales are logarithms and opacities logits, as splatfacto activates them itself. Culled
     Gaussians get the logit of opacity 0 and a centre behind the camera, where gsplat's projection
@@ -96,8 +96,8 @@ def new_dial(
 
 
 def state_of(dial: Dial) -> dict[str, Any]:
-    """What a checkpoint has to hold for ``new_dial``: tensors, and the settings as plain numbers
-    and names.
+    """Entries of a checkpoint for ``new_dial``: tensors, and the settings as plain numbers and
+    names.
     """
     return {**dial.state_dict(), SETTINGS: asdict(dial.attenuation)}
 

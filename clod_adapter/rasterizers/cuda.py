@@ -33,7 +33,8 @@ INSTALL = "pip install gsplat==1.5.3"
 
 @lru_cache(maxsize=1)
 def unusable() -> str | None:
-    """Why gsplat cannot render on a GPU here, with the command that fixes it; None if it can.
+    """The reason why gsplat cannot render on a GPU here, with the command that fixes it; None if it
+    can.
 
     The first call on a machine may compile gsplat's kernels, which takes minutes; gsplat prints a
     message.

@@ -55,8 +55,8 @@ class Splat(Protocol):
 
 @dataclass(frozen=True)
 class Rasterizer:
-    """What makes a picture of Gaussians at a dial value. Whatever renders, trains or measures
-    pictures calls ``draw``.
+    """Renderer of Gaussians at a dial value. Whatever renders, trains or measures pictures calls
+    ``draw``.
 
     The dial is composed with ``splat``. A subclass may have kernels with the dial in them, which
     give the same to rounding.

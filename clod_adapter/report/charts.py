@@ -133,7 +133,7 @@ def chart(draw: Draw, size: tuple[float, float]) -> Iterator[Any]:
 
 
 def _columns(axes: Any) -> int:
-    """How many columns of a legend have room."""
+    """The number of columns of a legend that have room."""
     return max(int(axes.figure.get_size_inches()[0] / COLUMN), 1)
 
 

@@ -262,8 +262,8 @@ def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, T
 
 
 def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera, reach: float) -> float:
-    """How likely a photograph was taken from here, ``log h - 0.5 p - 2 e - 1.5 b``; -inf if the
-    rendering is empty, or the mean log distance that of less than NEARER of the reach.
+    """The likelihood that a photograph was taken from here, ``log h - 0.5 p - 2 e - 1.5 b``; -inf
+    if the rendering is empty, or the mean log distance that of less than NEARER of the reach.
 
     h is the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels without
     ``growth`` (both weighted by alpha), e the share of pixels that are not covered, b that of the
@@ -292,7 +292,7 @@ def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera, reach: f
 
 
 def _opposite(camera: Camera) -> Camera:
-    """From the same place, a quarter of the horizon, backwards."""
+    """A camera at the same place that looks backwards, at a quarter of the horizon."""
     turn = torch.diag(camera.viewmat.new_tensor([-1.0, 1.0, -1.0, 1.0]))
     return replace(camera, viewmat=turn @ camera.viewmat, K=_intrinsics(0.5, *LOOK))
 

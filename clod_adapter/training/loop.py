@@ -134,7 +134,9 @@ def _initialized(
     progress: Listener | None = None,
     group: ProcessGroup | None = None,
 ) -> Gaussians:
-    """What training begins with: of a group, which may round differently, the first process's."""
+    """The Gaussians that training begins with; in a group the first process's, as others may round
+    differently.
+    """
     start = for_training(form_of(config).begin(reduced, views, config, progress))
     fields: Any = {name: getattr(start, name) for name in (*start.tensors(), "attenuation")}
     return start.replace(**(group.broadcast(fields) if group else fields)).to(reduced.means.device)

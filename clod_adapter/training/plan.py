@@ -70,7 +70,7 @@ class Override:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is trained, and how.
+    """Decisions on what is trained, and how.
 
     Attributes:
         base: the checkpoint that the plan was made for.

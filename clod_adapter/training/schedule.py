@@ -18,7 +18,7 @@ GOLDEN = (5**0.5 - 1) / 2
 
 @dataclass(frozen=True)
 class Schedule:
-    """What changes over a training; docs/method.md has the measurements."""
+    """Settings that change over a training; docs/method.md has the measurements."""
 
     full: float = 0.5  # share of the steps at s = 0 and s = 1 at first
     unattenuated: float = 0.25  # of these: at s = 0, where every Gaussian is as it is stored

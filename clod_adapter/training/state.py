@@ -117,7 +117,7 @@ class Adapted:
 
     @property
     def notes(self) -> list[str]:
-        """What ended training early, and what it did not move, a line each."""
+        """A line each on what ended training early and what it did not move."""
         lines = list[str]()
         if self.lost:
             lines.append(f"training ended at step {self.steps}: {self.lost}")

@@ -1,4 +1,5 @@
-"""Where a scene has its cameras, its photographs and every other file that reading it may open.
+"""The places where a scene has its cameras, its photographs and every other file that reading it
+may open.
 
 Needs neither pycolmap nor torch, so that a wrong folder is refused before they are imported.
 """
@@ -71,7 +72,9 @@ def models_in(folder: Path) -> list[Path]:
 
 
 def form_of(folder: Path) -> str:
-    """Which of FORMS a folder's COLMAP model has, empty without one; trainers need no points."""
+    """The one of FORMS that a folder's COLMAP model has, empty without one; trainers need no
+    points.
+    """
     for form in FORMS:
         if (folder / f"cameras{form}").is_file() and (folder / f"images{form}").is_file():
             return form
