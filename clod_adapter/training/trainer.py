@@ -73,9 +73,9 @@ class Trainer:
         self.rates = learning_rates(config, form.decay)
         # A frozen attribute requests no gradient from the rasterizer.
         tuned = [
-            n
-            for n in ATTRIBUTES
-            if n == "opacity_logits" or self.rates[n] > 0 and getattr(start, n).numel()
+            name
+            for name in ATTRIBUTES
+            if name == "opacity_logits" or self.rates[name] > 0 and getattr(start, name).numel()
         ]
         attributes: Any = {}
         for name in ATTRIBUTES:
@@ -139,9 +139,8 @@ class Trainer:
             loss = float(gradients.loss) / gradients.views
             if not math.isfinite(loss):
                 self._updating = False
-                names = ", ".join(
-                    view.camera.name or "a view without a name" for view, *_ in samples
-                )
+                cameras = [sample.view.camera for sample in samples]
+                names = ", ".join(camera.name or "a view without a name" for camera in cameras)
                 raise LossNotFinite(f"the loss of step {self.done + 1} is not finite ({names})")
         except Exception:
             self.sampler.restore(*before)
@@ -158,16 +157,17 @@ class Trainer:
         """The gradients summed over the first sample and those begun before ``until``
         (``perf_counter``).
         """
-        total = self._of_view(samples[0])
+        total = self._view_gradients(samples[0])
         for sample in samples[1:]:
             if time.perf_counter() >= until:
                 break
-            total += self._of_view(sample)
+            total += self._view_gradients(sample)
         return total
 
-    def _of_view(self, sample: Sample) -> GradientSum:
+    def _view_gradients(self, sample: Sample) -> GradientSum:
         """Renders one view at its dial value, and differentiates the objective."""
-        (view, s, counted, halved), first = sample, slice(self.count)
+        view, s, counted, halved = sample
+        trained_rows = slice(self.count)
         leaves = {
             name: value.detach().requires_grad_(name in self.stepped)
             for name, value in self.parameters.items()
@@ -176,18 +176,18 @@ class Trainer:
         if halved:
             gaussians = gaussians.replace(screen_filter=self.screen_filter.halved())
         rasterizer = for_device(gaussians.means.device)
-        kept = rasterizer.kept(gaussians, view.camera, s)[first]
+        kept = rasterizer.kept(gaussians, view.camera, s)[trained_rows]
         image = rasterizer.draw(gaussians, view.camera, s, trained=self.count)[0]
         loss = photometric_loss(image, view.image, self.config.ssim_weight)
         total = self.dial.objective(loss, gaussians, view.camera, s)
         stepped_gradients = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {
-            name: gradient[first]
+            name: gradient[trained_rows]
             for name, gradient in zip(self.stepped, stepped_gradients, strict=True)
         }
         unweighted = loss.detach().double()
         decay = self.dial.decay
-        parameter = self.parameters[decay][first]
+        parameter = self.parameters[decay][trained_rows]
         for counted_dial, weighted in self.dial.counts(s, counted, unweighted):
             gradients[decay] = gradients[decay] + self.dial.count_gradient(
                 parameter, counted_dial, weighted
