@@ -123,7 +123,7 @@ def numbers_of(name: str, values: Any) -> Tensor:
 
 
 def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]]) -> None:
-    """Refuses what is no pinhole camera."""
+    """Rejects what is no pinhole camera."""
     (fx, skew, _), (other_skew, fy, _), last = K
     axes = [row[:3] for row in viewmat[:3]]
     bent = max(

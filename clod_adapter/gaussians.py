@@ -23,7 +23,7 @@ SH_C0 = 0.28209479177387814
 """
 
 OPAQUE = 20.0
-"""A logit whose opacity is 1 in float32; written instead of +inf, which some readers refuse."""
+"""A logit whose opacity is 1 in float32; written instead of +inf, which some readers reject."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -262,7 +262,7 @@ def _inspect_tensors(path: Path) -> Inspection | None:
     about: dict[str, Any]
     if STATE_KEY in metadata:
         description = "the state of an interrupted run, for --resume"
-        state, belongs = load_state(path)
+        state, run_metadata = load_state(path)
         about = {
             "kind": "state",
             "writer": None,
@@ -270,7 +270,7 @@ def _inspect_tensors(path: Path) -> Inspection | None:
             "steps": state.steps,
             "seconds": state.seconds,
             "loss": state.loss,
-            "belongs": belongs,
+            "belongs": run_metadata,
             "attenuation": state.attenuation,
         }
     elif f'"{ADAPTER}"' in metadata.get(KEY, ""):

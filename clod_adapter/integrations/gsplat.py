@@ -234,7 +234,7 @@ def rasterization_inria_wrapper(
 ) -> tuple[Tensor, None, Meta]:
     """``gsplat.rasterization_inria_wrapper`` with a dial; see ``rasterization``.
 
-    gsplat 1.5 and 1.6 return one camera's image without the camera's dimension, and refuse several;
+    gsplat 1.5 and 1.6 return one camera's image without the camera's dimension, and reject several;
     several are returned as ``[C, H, W, X]`` here, as gsplat 1.4.0 returns them.
     """
     raise NotImplementedError

@@ -11,7 +11,7 @@ from typing import Any
 
 from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY, read_bytes
 from clod_adapter.io.settings import (
@@ -65,7 +65,7 @@ def load_adapter(path: str | Path) -> Adapter:
     tensors, metadata = parse_tensors(path, read_bytes(path))
     about, settings = _description(path, metadata)
     assert settings.attenuation is not None
-    with refused_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
+    with rejected_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
         names = [name for name in tensors if name.startswith(ADDED)]
         added = {name.removeprefix(ADDED): tensors.pop(name) for name in names}
         return Adapter(
@@ -85,13 +85,13 @@ def load_adapter(path: str | Path) -> Adapter:
 
 
 def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], Metadata]:
-    """The JSON document of an adapter, and the settings in it; refuses another file."""
+    """The JSON document of an adapter, and the settings in it; rejects another file."""
     if KEY not in metadata:
         raise ClodError(
             f"{path}: is a safetensors file but not an adapter; give a file that this package wrote"
         )
     about = parse_document(path, metadata[KEY], ADAPTER)
-    with refused_if_damaged(path, *DAMAGED):
+    with rejected_if_damaged(path, *DAMAGED):
         for name, kind in (("base_sha256", str), ("package_version", str), ("config", dict)):
             if not isinstance(about[name], kind):
                 raise TypeError(f"{name} is {about[name]!r:.40}, not a {kind.__name__}")

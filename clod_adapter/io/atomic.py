@@ -98,7 +98,7 @@ def output_lock(final: Path, *, of: Path | None = None) -> Iterator[None]:
 
 
 def check_target(final: Path) -> None:
-    """Refuses, before anything is written, what ``atomic_path`` could not write."""
+    """Rejects, before anything is written, what ``atomic_path`` could not write."""
     folder = final.parent
     if not folder.is_dir():
         raise ClodError(f"{final}: folder {folder} does not exist; create it first")

@@ -29,7 +29,7 @@ from clod_adapter.io.settings import (
     matching_calibration,
     stated_filter,
     tagged,
-    that_fit,
+    truncate_history,
 )
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
@@ -188,7 +188,7 @@ def load(
     about = [comment for comment in source.comments if not comment.startswith(PREFIX)]
     if source.head is None:
         about = tagged([re.sub("[^ -~]", "?", line) for line in about], screen_filter)
-    comments, cut = that_fit([*about, *values.changes])
+    comments, cut = truncate_history([*about, *values.changes])
     return Checkpoint(
         gaussians,
         rows,
@@ -267,7 +267,7 @@ def save(
 
 
 def _check_base(path: Path, gaussians: Gaussians, base: Checkpoint) -> None:
-    """Refuses to overwrite the base, and Gaussians that do not come from it."""
+    """Rejects the base as a target, and Gaussians that do not come from it."""
     inputs = [base.path, *ranks_of(base.path).values()]
     if path.is_file() and any(file.is_file() and path.samefile(file) for file in inputs):
         raise ClodError(

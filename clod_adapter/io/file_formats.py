@@ -1,7 +1,7 @@
 """The file formats of Gaussians, by the suffix of the file: one table, and first checks of a file,
 without torch.
 
-What reads, checks or refuses a file, here and in the readers, raises a ClodError of one line that
+What reads, checks or rejects a file, here and in the readers, raises a ClodError of one line that
 names the file.
 """
 
@@ -16,7 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.settings import Metadata, Source
 
@@ -35,7 +35,7 @@ class Format(NamedTuple):
     """
 
     module: str = ""  # under ``clod_adapter.io``, imported when it is used
-    check: str = "file_formats.check_start"  # refuses, without torch, a file of another format
+    check: str = "file_formats.check_start"  # rejects, without torch, a file of another format
     carries_sigma: bool = False  # whether the dial is written: sigma_d, growth_d and their settings
     # where it is written, the precision of its values; lines of at most 54 letters
     about: tuple[str, ...] = ()
@@ -73,7 +73,7 @@ def format_of(path: Path) -> Format:
 
 
 def check_readable(path: Path) -> None:
-    """Refuses, without torch, a file whose first bytes are not of its format."""
+    """Rejects, without torch, a file whose first bytes are not of its format."""
     _call(format_of(path).check, path)
 
 
@@ -85,7 +85,7 @@ def file_has_dial(path: Path) -> bool:
 
 
 def check_suffix(path: Path) -> None:
-    """Refuses a name whose suffix is none of WRITABLE."""
+    """Rejects a name whose suffix is none of WRITABLE."""
     if path.name.lower().endswith((".sog", ".compressed.ply")):
         raise ClodError(
             f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it"
@@ -98,7 +98,7 @@ def check_suffix(path: Path) -> None:
 
 
 def check_written(path: Path) -> None:
-    """Refuses a file just written that could not be read again: a PLY by its header and length,
+    """Rejects a file just written that could not be read again: a PLY by its header and length,
     others read whole.
     """
     try:
@@ -114,7 +114,7 @@ def read_source(path: Path) -> Source:
     """The content of a file in any format, with the other ranks of a checkpoint of several GPUs
     (``ranks``).
 
-    Every reader refuses, in one line, what is damaged or of another kind.
+    Every reader rejects, in one line, what is damaged or of another kind.
     """
     source = _read(path)
     ranks: dict[int, Path] = {} if source.metadata.described else _call("ranks.ranks_of", path)
@@ -177,17 +177,17 @@ _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b"
 
 
 def check_start(path: Path) -> None:
-    """Refuses a file whose first bytes are not of its suffix's format."""
+    """Rejects a file whose first bytes are not of its suffix's format."""
     suffix = path.suffix.lower()
     start = read_bytes(path, START)
-    refuse_known(path, start)
+    reject_known(path, start)
     if suffix in _START and not start.startswith(_START[suffix]):
-        refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
+        reject(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
         _call("formats.splat_transform.check", path)
     # a .splat has no header: other files are known by their size, and a PLY by its first bytes
     if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):
-        refuse(
+        reject(
             path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again"
         )
     header = _call("tensor_file.read_tensor_header", path)[1] if suffix == ".safetensors" else {}
@@ -249,14 +249,14 @@ OTHERS: dict[str | bytes, tuple[str, str]] = {
 }
 
 
-def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> None:
-    """Refuses what exists and is not a regular file: reading a pipe would wait."""
+def reject_irregular(path: Path, remedy: str = "give the name of a file") -> None:
+    """Rejects what exists and is not a regular file: reading a pipe would wait."""
     if path.exists() and not path.is_file():
         raise ClodError(f"{path}: cannot be read (it is not a regular file); {remedy}")
 
 
-def refuse_long_numbers(path: Path, text: bytes) -> None:
-    """Refuses a number of a thousand digits, of which parsers make copies."""
+def reject_long_numbers(path: Path, text: bytes) -> None:
+    """Rejects a number of a thousand digits, of which parsers make copies."""
     if re.search(rb"\d{1000}", text):
         raise ClodError(
             f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again"
@@ -266,14 +266,14 @@ def refuse_long_numbers(path: Path, text: bytes) -> None:
 def read_bytes(path: Path, most: int = -1) -> bytes:
     """The bytes of a file, or its first ones."""
     # ValueError: a name that holds a NUL
-    with refused_if_damaged(path, "cannot be read", "check the path"):
-        refuse_irregular(path)
+    with rejected_if_damaged(path, "cannot be read", "check the path"):
+        reject_irregular(path)
         with open(path, "rb") as file:
             return file.read(most)
 
 
-def refuse_known(path: Path, start: bytes) -> None:
-    """Refuses a file whose first bytes are never those of a splat."""
+def reject_known(path: Path, start: bytes) -> None:
+    """Rejects a file whose first bytes are never those of a splat."""
     if not start:
         raise ClodError(f"{path}: is empty; copy or export it again")
     text = start.lstrip()[:64].lower()
@@ -282,9 +282,9 @@ def refuse_known(path: Path, start: bytes) -> None:
             raise ClodError(f"{path}: is {content}; {remedy}")
 
 
-def refuse(path: Path, start: bytes, otherwise: str) -> NoReturn:
-    """Refuses a file, with its kind by the tables, or else with the message ``otherwise``."""
-    refuse_known(path, start)
+def reject(path: Path, start: bytes, otherwise: str) -> NoReturn:
+    """Rejects a file, with its kind by the tables, or else with the message ``otherwise``."""
+    reject_known(path, start)
     for key, (content, remedy) in OTHERS.items():
         if key == path.suffix.lower() or (isinstance(key, bytes) and start.startswith(key)):
             raise ClodError(f"{path}: is {content}; {remedy.format(suffix=path.suffix)}")

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
 
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io import file_formats
 from clod_adapter.io.ply_layout import RGB, column_map, is_coloured, ply_metadata, with_harmonics
 from clod_adapter.io.ply_layout import write as write
@@ -65,7 +65,7 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
     """
     start = file_formats.read_bytes(path, HEADER_LIMIT) if data is None else data[:HEADER_LIMIT]
     if not re.match(rb"ply\r?\n|ply\r", start):
-        file_formats.refuse(
+        file_formats.reject(
             path, start, "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
         )
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
@@ -87,7 +87,7 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
         )
     counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,20})[ \t]*$", header)
     header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,20}[ \t]*$", rb"\g<1>0", header)
-    with refused_if_damaged(path, "the PLY header is damaged", "export the file again"):
+    with rejected_if_damaged(path, "the PLY header is damaged", "export the file again"):
         ply = PlyData.read(io.BytesIO(header), mmap=False)
     if len(counts) != len(ply.elements):
         raise ClodError(
@@ -104,7 +104,7 @@ def _in_ascii(line: re.Match[bytes]) -> bytes:
 
 
 def has_dial(path: Path) -> bool:
-    """Whether the header has a sigma_d; refuses another kind, damaged settings, and too few bytes
+    """Whether the header has a sigma_d; rejects another kind, damaged settings, and too few bytes
     for its rows.
     """
     head = read_head(path)
@@ -120,7 +120,7 @@ def read(path: Path, data: bytes) -> Source:
     head = read_head(path, data)
     degree = sh_degree_of(path, head.ply)
     _check_length(path, head, len(data))
-    with refused_if_damaged(path):
+    with rejected_if_damaged(path):
         elements = _elements(data, head)
     if is_packed(head.ply):
         metadata = ply_metadata(path, head.comments, dial=False)
@@ -200,7 +200,7 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
 
 
 def _check_length(path: Path, head: Head, length: int) -> None:
-    """Refuses a file that is too short for the least bytes that the rows of its header take."""
+    """Rejects a file that is too short for the least bytes that the rows of its header take."""
     text = head.ply.text
     least = head.size - text
     for element, count in head.elements:
@@ -221,7 +221,7 @@ def _check_length(path: Path, head: Head, length: int) -> None:
 
 
 def sh_degree_of(path: Path, header: PlyData) -> int:
-    """The SH degree of a checkpoint with this header; refuses something else, and missing
+    """The SH degree of a checkpoint with this header; rejects something else, and missing
     columns.
     """
     if is_packed(header):

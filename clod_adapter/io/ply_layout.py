@@ -228,7 +228,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     """
     from clod_adapter.gaussians import OPAQUE  # here: a header is checked without torch
 
-    arrays_of(path, gaussians)  # refuses rows that load would drop
+    arrays_of(path, gaussians)  # rejects rows that load would drop
     opaque = gaussians.opacity_logits.isposinf()
     gaussians = gaussians.replace(
         opacity_logits=gaussians.opacity_logits.masked_fill(opaque, OPAQUE)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from glob import escape
 from pathlib import Path
 
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.settings import Source
 
 _NAME = re.compile(
@@ -30,7 +30,7 @@ def ranks_of(path: Path) -> dict[int, Path]:
 
 
 def check_ranks(path: Path, ranks: dict[int, Path]) -> None:
-    """Refuses a checkpoint of which a rank is missing; Grendel-GS has their number in its names."""
+    """Rejects a checkpoint of which a rank is missing; Grendel-GS has their number in its names."""
     match = _NAME.fullmatch(path.name)
     count = max(int((match and match["count"]) or 0), max(ranks) + 1)
     if missing := set(range(count)) - ranks.keys():
@@ -45,7 +45,7 @@ def joined(path: Path, sources: Sequence[Source]) -> Source:
     import numpy as np  # here: names are checked without it
 
     first = sources[0]
-    with refused_if_damaged(
+    with rejected_if_damaged(
         path, "does not fit the other ranks beside it", "put those of one run into a folder"
     ):
         arrays = {}

@@ -5,8 +5,8 @@ to the fields of their classes, ``calibration`` as Calibration.as_dict, ``origin
 ``about`` to lines of text, and ``package_version``.
 
 Formats other than PLY store it as a JSON document under the key ``clod_adapter``
-(``file_formats.KEY``). An unknown field is ignored with a note, a damaged setting is refused, and a
-damaged calibration, which rendering does not need, is ignored with a note.
+(``file_formats.KEY``). An unknown field is ignored with a note, a damaged setting is rejected, and
+a damaged calibration, which rendering does not need, is ignored with a note.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from clod_adapter._support.text import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.origin import NOWHERE, Origin, parse_origin
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ KINDS = {
         " none",
     ),
 }
-# what is wrong and what to do, for ``refused_if_damaged``
+# what is wrong and what to do, for ``rejected_if_damaged``
 DAMAGED = "its settings are damaged", "restore them, or export the file again"
 # Settings of a dial before every Gaussian had a reach.
 EARLIER = {"tau", "eps", "cut", "normalizer"}
@@ -97,7 +97,7 @@ def read_metadata(
     defaults.
     """
     notes: list[str] = []
-    with refused_if_damaged(path, *DAMAGED):
+    with rejected_if_damaged(path, *DAMAGED):
         version = values.get("package_version", "")
         if not isinstance(version, str):
             raise TypeError(f"package_version is {version!r:.40}, not a string")
@@ -184,7 +184,7 @@ def of_another_method(names: Iterable[str]) -> list[str]:
     return lines
 
 
-def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def truncate_history(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The lines of a file's history that every output has room for, the last ones first; and a note
     on the others.
     """
@@ -244,9 +244,9 @@ def parse_metadata(
 
 
 def parse_document(path: Path, text: str | bytes | dict[str, Any], kind: str) -> dict[str, Any]:
-    """A document of this kind; refuses another kind, and a newer version."""
+    """A document of this kind; rejects another kind, and a newer version."""
     version, wrong = KINDS[kind]
-    with refused_if_damaged(path, *DAMAGED):
+    with rejected_if_damaged(path, *DAMAGED):
         values: dict[str, Any] = text if isinstance(text, dict) else json.loads(text)
         stored = values["format"]
         newer = stored == kind and values["format_version"] > version

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from safetensors import safe_open
 
-from clod_adapter.errors import ClodError, refused_if_damaged
-from clod_adapter.io.file_formats import KEY, START, read_bytes, refuse_known
+from clod_adapter.errors import ClodError, rejected_if_damaged
+from clod_adapter.io.file_formats import KEY, START, read_bytes, reject_known
 from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
@@ -56,7 +56,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the metadata of a file; for ``refused_if_damaged``."""
+    """The tensors and the metadata of a file; for ``rejected_if_damaged``."""
     with open(path, "rb") as file, safe_open(_name_of(file), framework="pt") as tensors:
         # Copies, since the file may change under a memory map.
         names = tensors.keys()
@@ -68,8 +68,8 @@ def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str,
     """The tensors and the metadata of an input file with these bytes."""
     from safetensors.torch import load  # here: a header is read without torch
 
-    refuse_known(path, data[:START])
-    with refused_if_damaged(path, *_DAMAGED):
+    reject_known(path, data[:START])
+    with rejected_if_damaged(path, *_DAMAGED):
         tensors = load(data)
         head = data[8 : 8 + int.from_bytes(data[:8], "little")]
         return tensors, json.loads(head).get("__metadata__", {})
@@ -77,9 +77,9 @@ def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str,
 
 def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
     """The names of the tensors and the metadata, without torch."""
-    refuse_known(path, read_bytes(path, START))
+    reject_known(path, read_bytes(path, START))
     with (
-        refused_if_damaged(path, *_DAMAGED),
+        rejected_if_damaged(path, *_DAMAGED),
         open(path, "rb") as file,
         safe_open(_name_of(file), framework="np") as tensors,
     ):
@@ -93,7 +93,7 @@ def _name_of(file: BufferedReader) -> str:
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes every value unchanged."""
-    arrays_of(path, gaussians)  # refuses rows that load would drop
+    arrays_of(path, gaussians)  # rejects rows that load would drop
     tensors = {name: tensor.float() for name, tensor in gaussians.tensors().items()}
     write_tensors(path, tensors, {KEY: document(MODEL, metadata)})
     return ()

@@ -51,7 +51,7 @@ def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
 
 
 def degree_of(path: Path, rest: int) -> int:
-    """The SH degree that this many ``f_rest_*`` make; refuses a number that makes none."""
+    """The SH degree that this many ``f_rest_*`` make; rejects a number that makes none."""
     degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}
     if rest in degrees:
         return degrees[rest]
@@ -83,7 +83,7 @@ def prepared(
     them: one at least.
 
     Args:
-        activated: which values are activated, where their range allows both; None to refuse then.
+        activated: which values are activated, where their range allows both; None to reject then.
         origin: what the means are to be relative to; None for ``at``, or what ``origin_of`` finds
             where that is 0.
     """
@@ -267,7 +267,7 @@ def hidden(gaussians: Gaussians) -> dict[str, Tensor]:
 
 
 def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
-    """The float32 arrays of ``hidden``; refuses values that ``load`` would drop."""
+    """The float32 arrays of ``hidden``; rejects values that ``load`` would drop."""
     arrays = _on_the_host(gaussians.tensors())
     if dropped := _usable(arrays)[1]:
         spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()]

@@ -47,7 +47,7 @@ TRAINED = 30000
 checkpoint.
 """
 
-# Learning rates in nerfstudio's checkpoints are numpy's numbers, which torch 2.6 and newer refuse
+# Learning rates in nerfstudio's checkpoints are numpy's numbers, which torch 2.6 and newer reject
 # to read, in nerfstudio's own commands too. These names run no code. Older versions of torch cannot
 # be told of them.
 if torch.__version__ >= "2.6":

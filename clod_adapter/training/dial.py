@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from clod_adapter.cameras import Camera, Scene, StoredView, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.attenuation import GROWTH_RANGE, SIGMA_MAX, Attenuated, reach_fade
-from clod_adapter.equation.attenuation import dial as dialled_by
+from clod_adapter.equation.attenuation import dial as attenuate_gaussians
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, require_finite
@@ -187,7 +187,7 @@ class Dial(nn.Module):
         growth. ``integrations.gsplat.rasterization`` takes ``sigma_d``, ``growth_d`` and
         ``attenuation`` instead.
         """
-        return dialled_by(self.gaussians(), camera, virtual_scale)
+        return attenuate_gaussians(self.gaussians(), camera, virtual_scale)
 
     def loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
         """0-d, the objective of one rendering at s: ``w_s rendering_loss`` and the target-count

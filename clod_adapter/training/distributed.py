@@ -126,7 +126,7 @@ class ProcessGroup:
 
 
 def require_distributed() -> None:
-    """Refuses a torch that cannot train in several processes; 2.4 and 2.6 hang in the exchange of
+    """Rejects a torch that cannot train in several processes; 2.4 and 2.6 hang in the exchange of
     three.
     """
     if not dist.is_available():

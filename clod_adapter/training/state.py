@@ -10,11 +10,11 @@ from torch import Tensor
 
 from clod_adapter.adapter import Adapter, extract
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.file_formats import refuse_irregular
+from clod_adapter.io.file_formats import reject_irregular
 from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
 KEY = "clod_adapter_state"  # of the JSON document in the metadata of a file
@@ -59,7 +59,7 @@ class TrainingState:
             )
 
     def check(self, expected: dict[str, Tensor]) -> None:
-        """Refuses a state of another run than that with tensors ``expected``, and values that
+        """Rejects a state of another run than that with tensors ``expected``, and values that
         training cannot produce.
         """
         if _layout(expected) != _layout(self.tensors):
@@ -146,31 +146,33 @@ def extract_adapter(base: Checkpoint, adapted: Adapted, config: AdaptConfig) -> 
     )
 
 
-def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) -> None:
+def save_state(path: str | Path, state: TrainingState, run_metadata: dict[str, Any]) -> None:
     """Writes a state, and plain JSON that identifies its run; loading gives the same bits."""
     # Not asdict of the whole, which would copy the tensors.
     about = {f.name: getattr(state, f.name) for f in fields(state) if f.name != "tensors"}
     metadata = {
-        KEY: json.dumps({**about, "attenuation": asdict(state.attenuation), "belongs": belongs})
+        KEY: json.dumps(
+            {**about, "attenuation": asdict(state.attenuation), "belongs": run_metadata}
+        )
     }
     with atomic_path(path) as temporary:
         write_tensors(temporary, state.tensors, metadata)
 
 
 def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
-    """Reads a state, and ``belongs`` of the run that saved it."""
+    """Reads a state, and the metadata of the run that saved it."""
     path = Path(path)
-    refuse_irregular(path, "delete it to start over")
-    with refused_if_damaged(
+    reject_irregular(path, "delete it to start over")
+    with rejected_if_damaged(
         path, "is not a training state or is damaged", "delete it to start over"
     ):
         tensors, metadata = read_tensors(path)
         about = json.loads(metadata[KEY])
-        belongs = dict(about.pop("belongs"))
+        run_metadata = dict(about.pop("belongs"))
         attenuation = AttenuationConfig(**about.pop("attenuation"))
         random = dict(about.pop("random"))
         order = tuple(map(int, about.pop("order")))
         counts: Any = {
             name: (int if name in ("averaged", "steps") else float)(n) for name, n in about.items()
         }
-        return TrainingState(tensors, attenuation, random, order, **counts), belongs
+        return TrainingState(tensors, attenuation, random, order, **counts), run_metadata

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from clod_adapter._support.text import package_version
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import KEY
@@ -175,7 +175,7 @@ def write_points(
 
 def has_dial(path: Path) -> bool:
     """Whether the primitive has a sigma_d; the file is mapped, and its values are not read."""
-    with refused_if_damaged(path, *_DAMAGED):
+    with rejected_if_damaged(path, *_DAMAGED):
         gltf, _ = _chunks(path, np.memmap(path, np.uint8, "r").data)
         (_, primitive), *_ = _find(path, gltf)
         return DIAL[SIGMA] in primitive["attributes"]
@@ -187,7 +187,7 @@ def read(path: Path, data: bytes) -> Source:
     Under a node without a rotation the values are in glTF's own axes, and are turned here; files of
     this package have the half turn in the node and store the checkpoint's values.
     """
-    with refused_if_damaged(path, *_DAMAGED):
+    with rejected_if_damaged(path, *_DAMAGED):
         gltf, binary = _chunks(path, memoryview(data))
         (mesh, primitive), *others = _find(path, gltf)
         attributes = primitive["attributes"]

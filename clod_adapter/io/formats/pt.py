@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clod_adapter.errors import ClodError, refused_if_damaged
-from clod_adapter.io.file_formats import KEY, START, read_bytes, refuse
+from clod_adapter.errors import ClodError, rejected_if_damaged
+from clod_adapter.io.file_formats import KEY, START, read_bytes, reject
 from clod_adapter.io.settings import (
     MODEL,
     WARNING,
@@ -50,7 +50,7 @@ _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|
 
 
 def check(path: Path) -> None:
-    """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it
+    """Rejects, without torch, what is not a file of ``torch.save``, or would unpack to more than it
     is.
     """
     start = read_bytes(path, START)
@@ -59,8 +59,8 @@ def check(path: Path) -> None:
             f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again"
         )
     if not start.startswith(b"PK"):
-        refuse(path, start, "is no file of torch.save; export the checkpoint as a PLY")
-    with refused_if_damaged(path), zipfile.ZipFile(path) as archive:
+        reject(path, start, "is no file of torch.save; export the checkpoint as a PLY")
+    with rejected_if_damaged(path), zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
         stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
@@ -98,7 +98,7 @@ def read(path: Path, data: bytes) -> Source:
     from clod_adapter.integrations.splats import NAMES
 
     with (
-        refused_if_damaged(
+        rejected_if_damaged(
             path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY"
         ),
         warnings.catch_warnings(),

@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import START, read_bytes, refuse_known
+from clod_adapter.io.file_formats import START, read_bytes, reject_known
 
 if TYPE_CHECKING:
     from clod_adapter.io.settings import Source
@@ -142,8 +142,8 @@ class SplatTransform:
 
 
 def check(path: Path) -> SplatTransform:
-    """The converter; refuses what cannot be converted here."""
-    refuse_known(path, read_bytes(path, START))
+    """The converter; rejects what cannot be converted here."""
+    reject_known(path, read_bytes(path, START))
     try:
         return SplatTransform.find()
     except ClodError as error:

@@ -36,7 +36,7 @@ from clod_adapter.equation.units import (
     known_distance,
     with_distance,
 )
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ, START, read_bytes
@@ -258,7 +258,7 @@ def read(path: Path, data: bytes) -> Source:
 def _unpacked(path: Path, data: bytes) -> bytes:
     limit = max(_SMALL, _BOMB * len(data))
     gzip = zlib.decompressobj(wbits=31)
-    with refused_if_damaged(path):
+    with rejected_if_damaged(path):
         unpacked = gzip.decompress(data, limit)
     if not gzip.eof or len(unpacked) < HEADER.size:
         raise ClodError(
@@ -285,7 +285,7 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str
     length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
     text = body[4 : 4 + length]
     halves = body[4 + length :]
-    with refused_if_damaged(path, *DAMAGED):
+    with rejected_if_damaged(path, *DAMAGED):
         stored = json.loads(text)
         names = stored.get(COLUMNS, [SIGMA])
         known_names = list(dial_columns(names)) if isinstance(names, list) else []

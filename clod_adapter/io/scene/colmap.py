@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from clod_adapter.errors import ClodError, refused_if_damaged
-from clod_adapter.io.file_formats import read_bytes, refuse_long_numbers
+from clod_adapter.errors import ClodError, rejected_if_damaged
+from clod_adapter.io.file_formats import read_bytes, reject_long_numbers
 from clod_adapter.io.scene.folder import FORMS, find_cameras, form_of, name_parts
 from clod_adapter.origin import NOWHERE
 
@@ -94,7 +94,7 @@ def marked(
 
 
 def check_posed(image: PosedImage, source: Path) -> PosedImage:
-    """The image; refuses a camera or pose that is not finite, too large, or cannot become a
+    """The image; rejects a camera or pose that is not finite, too large, or cannot become a
     pinhole.
     """
     camera = image.camera
@@ -118,7 +118,7 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
     form = form_of(model)
     path = model / f"images{form}"
     cameras = _cameras(model / f"cameras{form}")
-    with refused_if_damaged(path, DAMAGED):
+    with rejected_if_damaged(path, DAMAGED):
         records = sorted((_images if form == ".bin" else _images_in_text)(path))
         stated = re.search(rb"^# *Number of images: *(\d+)", read_bytes(path, START), re.MULTILINE)
     posed = []
@@ -130,7 +130,7 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
                 " both"
             )
         viewmat = np.eye(4)
-        with refused_if_damaged(path, f"image {name!r} has no rotation"):
+        with rejected_if_damaged(path, f"image {name!r} has no rotation"):
             # of any length; scipy has w last
             viewmat[:3, :3] = Rotation.from_quat(np.roll(quat, -1)).as_matrix()
         viewmat[:3, 3] = translation
@@ -159,14 +159,14 @@ def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.
     points = list[Sequence[float]]()
     path = next((file for form in FORMS if (file := model / f"points3D{form}").is_file()), None)
     if path is not None:
-        with refused_if_damaged(path, DAMAGED):
+        with rejected_if_damaged(path, DAMAGED):
             points += (_points if path.suffix == ".bin" else _points_in_text)(path)
     return torch.from_numpy(np.array(points, np.float64).reshape(-1, 3) - origin)
 
 
 def _cameras(path: Path) -> dict[int, pycolmap.Camera]:
     cameras = {}
-    with refused_if_damaged(path, DAMAGED):
+    with rejected_if_damaged(path, DAMAGED):
         records = _camera_records(path) if path.suffix == ".bin" else _cameras_in_text(path)
         for camera, params in records:
             if len(params) != len(camera.params):
@@ -232,7 +232,7 @@ def _points(path: Path) -> Iterator[Sequence[float]]:
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
     """Number and content of the lines that are neither blank nor comments."""
     text = read_bytes(path)
-    refuse_long_numbers(path, text)
+    reject_long_numbers(path, text)
     for number, line in enumerate(map(bytes.strip, text.splitlines()), start=1):
         if line and not line.startswith(b"#"):
             yield number, line

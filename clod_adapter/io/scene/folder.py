@@ -1,7 +1,7 @@
 """The places where a scene has its cameras, its photographs and every other file that reading it
 may open.
 
-Needs neither pycolmap nor torch, so that a wrong folder is refused before they are imported.
+Needs neither pycolmap nor torch, so that a wrong folder is rejected before they are imported.
 """
 
 import json
@@ -14,8 +14,8 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from clod_adapter._support.text import as_text, file_name
-from clod_adapter.errors import ClodError, refused_if_damaged
-from clod_adapter.io.file_formats import read_bytes, refuse_long_numbers
+from clod_adapter.errors import ClodError, rejected_if_damaged
+from clod_adapter.io.file_formats import read_bytes, reject_long_numbers
 
 TRANSFORMS = ("transforms_train.json", "transforms.json")
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
@@ -172,7 +172,7 @@ def _without_suffix(path: Path) -> Path:
 
 
 def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str, ...]:
-    """The parts of a photograph's name, split at / and at the \\ of files made on Windows; refuses
+    """The parts of a photograph's name, split at / and at the \\ of files made on Windows; rejects
     what is no name.
 
     Of a path that leads out of ``home``, the longest end that is a file there, with one of ENDINGS.
@@ -241,7 +241,7 @@ def scene_files(folder: Path) -> Iterator[Path]:
 
 
 def _names_in_json(path: Path) -> Iterator[str]:
-    """Names in the frames of a transforms file; none of a damaged one, which its reader refuses."""
+    """Names in the frames of a transforms file; none of a damaged one, which its reader rejects."""
     try:
         frames = read_json(path).get("frames")
     except ClodError:
@@ -260,8 +260,8 @@ def read_json(path: Path) -> dict[str, Any]:
             " path"
         )
     text = read_bytes(path)
-    refuse_long_numbers(path, text)
-    with refused_if_damaged(path, "is no JSON or damaged", "export it again"):
+    reject_long_numbers(path, text)
+    with rejected_if_damaged(path, "is no JSON or damaged", "export it again"):
         content = json.loads(text)
     if not isinstance(content, dict):
         raise ClodError(f"{path}: is no JSON object; copy or export it again")

@@ -18,7 +18,7 @@ import pycolmap
 from PIL import Image, PngImagePlugin, UnidentifiedImageError
 
 from clod_adapter._kernels.memory import release
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import read_bytes
 from clod_adapter.io.scene.colmap import HUGE, PosedImage
@@ -106,7 +106,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    with refused_if_damaged(path, "cannot be decoded"):
+    with rejected_if_damaged(path, "cannot be decoded"):
         try:
             with Image.open(path, formats=FORMATS) as source:
                 yield source
@@ -229,7 +229,7 @@ def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
         if not image.is_pinhole:
             # As ``colmap image_undistorter`` by default: bilinear, the same focal length, and no
             # blank pixel.
-            with refused_if_damaged(
+            with rejected_if_damaged(
                 path, "COLMAP cannot undistort it", "check its camera's parameters"
             ):
                 bitmap = pycolmap.Bitmap.from_array(np.asarray(pixels))

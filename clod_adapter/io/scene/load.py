@@ -178,7 +178,7 @@ def _load(loads: Sequence[Load], progress: Listener | None) -> tuple[list[View],
     notes: list[Note] = []
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
     with warnings.catch_warnings(), closing(in_order(loads, workers)) as loaded:
-        # Large, but below the size at which it is refused: photographs are no attack.
+        # Large, but below the size at which it is rejected: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         for view, remarks in loaded:
             views.append(view)
