@@ -166,14 +166,15 @@ class Trainer:
 
     def _view_gradients(self, sample: Sample) -> GradientSum:
         """Renders one view at its dial value, and differentiates the objective."""
-        view, s, counted, halved = sample
+        view = sample.view
+        s = sample.dial
         trained_rows = slice(self.count)
         leaves = {
             name: value.detach().requires_grad_(name in self.stepped)
             for name, value in self.parameters.items()
         }
         gaussians = self._assembled(leaves)
-        if halved:
+        if sample.halved:
             gaussians = gaussians.replace(screen_filter=self.screen_filter.halved())
         rasterizer = for_device(gaussians.means.device)
         kept = rasterizer.kept(gaussians, view.camera, s)[trained_rows]
@@ -188,7 +189,7 @@ class Trainer:
         unweighted = loss.detach().double()
         decay = self.dial.decay
         parameter = self.parameters[decay][trained_rows]
-        for counted_dial, weighted in self.dial.counts(s, counted, unweighted):
+        for counted_dial, weighted in self.dial.counts(s, sample.counted, unweighted):
             gradients[decay] = gradients[decay] + self.dial.count_gradient(
                 parameter, counted_dial, weighted
             )
