@@ -41,12 +41,17 @@ def adam_rows(
     most = corrections.shape[1] - 1
     rate = float32(rate)
     stride = int64(len(units) > 1)
-    beta1, beta2, epsilon = splat(float32(beta1)), splat(float32(beta2)), float32(epsilon)
+    beta1 = splat(float32(beta1))
+    beta2 = splat(float32(beta2))
+    epsilon = float32(epsilon)
     rest1, rest2 = 1 - beta1, 1 - beta2
     begin, end = share(worker, workers, len(parameter))
-    lengths, factors = scratch(float32, ROOM), scratch(float32, ROOM)
-    parameter, gradient = pointer(parameter), pointer(gradient)
-    first, second = pointer(first), pointer(second)
+    lengths = scratch(float32, ROOM)
+    factors = scratch(float32, ROOM)
+    parameter = pointer(parameter)
+    gradient = pointer(gradient)
+    first = pointer(first)
+    second = pointer(second)
     for start in range(begin, end, 16):
         stop, any_marked = min(start + 16, end), False
         for row in range(start, stop):
@@ -64,7 +69,8 @@ def adam_rows(
                 for k in range(width * (row - start), width * (row - start + 1)):
                     lengths[k], factors[k] = length, factor
         for k in range(0, 16 * width, 16):
-            factor, at = load(factors, k), width * start + k
+            factor = load(factors, k)
+            at = width * start + k
             chosen = gt(factor, 0)
             if anywhere(chosen):
                 g = load_where(chosen, gradient, at)

@@ -58,7 +58,8 @@ from clod_adapter._kernels.tiles import spans
 BLOCK, ACROSS = 4, 16  # pixels of a block, and blocks of a tile
 BLOCKS = ACROSS * ACROSS
 WORDS = BLOCKS // 64
-FORWARD_STATE, BACKWARD_STATE = BLOCKS * 64, BLOCKS * 80
+FORWARD_STATE = BLOCKS * 64
+BACKWARD_STATE = BLOCKS * 80
 BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 LANE_X = np.tile(np.arange(4, dtype=np.float32) + 0.5, 4)
@@ -162,17 +163,23 @@ def blend(worker, workers, tiles, cursor, room, background, picture):
     compile it).
     """
     count = len(tiles.order)
-    tiles, picture = pointers(tiles), pointers(picture)
-    records, entries = tiles.records, tiles.entries
-    offsets, masks = tiles.offsets, tiles.masks
-    cursor, background, state = pointer(cursor), pointer(background), pointer(room[worker])
+    tiles = pointers(tiles)
+    picture = pointers(picture)
+    records = tiles.records
+    entries = tiles.entries
+    offsets = tiles.offsets
+    masks = tiles.masks
+    cursor = pointer(cursor)
+    background = pointer(background)
+    state = pointer(room[worker])
     live = scratch(uint64, WORDS)
     while True:
         turn = count_up(cursor)
         if turn >= count:
             break
         tile = tiles.order[turn]
-        ox, oy = (tile % tiles.across) * TILE, (tile // tiles.across) * TILE
+        ox = (tile % tiles.across) * TILE
+        oy = (tile // tiles.across) * TILE
         for k in range(FORWARD_STATE):
             state[k] = 0
         start_tile(ox, oy, tiles, state, 64, live)
@@ -210,7 +217,8 @@ def blend(worker, workers, tiles, cursor, room, background, picture):
 @part
 def write_tile(ox, oy, tiles, state, background, picture):
     """Composites the tile over the background into the picture."""
-    width, height = tiles.width, tiles.height
+    width = tiles.width
+    height = tiles.height
     part = scratch(float32, 64)
     for block in range(BLOCKS):
         x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 64
@@ -234,7 +242,8 @@ def read_tile(ox, oy, tiles, picture, gradients, state):
     """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three
     channels.
     """
-    width, height = tiles.width, tiles.height
+    width = tiles.width
+    height = tiles.height
     part = scratch(float32, 80)
     for block in range(BLOCKS):
         x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 80
@@ -282,18 +291,25 @@ def blend_gradient(
     v . C, so nothing is stored per pixel and Gaussian. Each pair has its own slot.
     """
     count = len(tiles.order)
-    tiles, picture, gradients = pointers(tiles), pointers(picture), pointers(gradients)
-    records, entries = tiles.records, tiles.entries
-    offsets, masks = tiles.offsets, tiles.masks
-    entry_slots, pair_sums = pointer(entry_slots), pointer(pair_sums)
-    cursor, state = pointer(cursor), pointer(room[worker])
+    tiles = pointers(tiles)
+    picture = pointers(picture)
+    gradients = pointers(gradients)
+    records = tiles.records
+    entries = tiles.entries
+    offsets = tiles.offsets
+    masks = tiles.masks
+    entry_slots = pointer(entry_slots)
+    pair_sums = pointer(pair_sums)
+    cursor = pointer(cursor)
+    state = pointer(room[worker])
     live = scratch(uint64, WORDS)
     while True:
         turn = count_up(cursor)
         if turn >= count:
             break
         tile = tiles.order[turn]
-        ox, oy = (tile % tiles.across) * TILE, (tile // tiles.across) * TILE
+        ox = (tile % tiles.across) * TILE
+        oy = (tile // tiles.across) * TILE
         if ox + TILE > tiles.width or oy + TILE > tiles.height:
             for k in range(BACKWARD_STATE):  # pixels outside have weight 0, but 0 times NaN is NaN
                 state[k] = 0

@@ -142,9 +142,14 @@ def color(first, count, stored, drawing, packed):
     """Writes the colours ``max(0, 0.5 + SH)`` of ``count`` packed records from ``first`` on;
     returns how many remain: only finite ones.
     """
-    records, depths, ids = packed.records, packed.depths, packed.ids
-    w, sh, basis = scratch(f32x16, 16), scratch(f32x16, 80), scratch(f32x16, 25)
-    rows, targets = scratch(int64, 16), scratch(int64, 16)
+    records = packed.records
+    depths = packed.depths
+    ids = packed.ids
+    w = scratch(f32x16, 16)
+    sh = scratch(f32x16, 80)
+    basis = scratch(f32x16, 25)
+    rows = scratch(int64, 16)
+    targets = scratch(int64, 16)
     terms = (drawing.degree + 1) * (drawing.degree + 1) - 1
     end = first + count
     kept = first

@@ -40,8 +40,12 @@ def count_slope(worker, workers, sigma, d, dial2, lift, penalty, out):
     culled, at least ``penalty lift``.
     """
     first, last = share(worker, workers, len(sigma))
-    sigma, d, out = pointer(sigma), pointer(d), pointer(out)
-    square, least, scale = float32(dial2), float32(lift), float32(penalty)
+    sigma = pointer(sigma)
+    d = pointer(d)
+    out = pointer(out)
+    square = float32(dial2)
+    least = float32(lift)
+    scale = float32(penalty)
     for i in range(first, last, 16):
         reach, far2 = load_squares(i, last - i, sigma, d, square)
         reach2 = squared_reach(reach, far2)

@@ -94,7 +94,8 @@ def kept(at, many, stored, drawing):
 
     Activated opacities are 1/255 at least.
     """
-    cam, dial = drawing.cam, drawing.dial
+    cam = drawing.cam
+    dial = drawing.dial
     if dial[ACTIVATED] > 0:
         opacity = load_some(stored.opacities, at, many)
         visible = both(ge(opacity, ALPHA_MIN), gt(HUGE, opacity))
@@ -113,8 +114,12 @@ def kept(at, many, stored, drawing):
 def mark_kept(worker, workers, means, sigma, cam, dial, out):
     """``out [N]`` uint8: 1 for rows that the dial keeps, in front of the camera or not."""
     first, last = share(worker, workers, len(sigma))
-    means, sigma, out = pointer(means), pointer(sigma), pointer(out)
-    cam, dial, w = pointer(cam), pointer(dial), scratch(f32x16, 3)
+    means = pointer(means)
+    sigma = pointer(sigma)
+    out = pointer(out)
+    cam = pointer(cam)
+    dial = pointer(dial)
+    w = scratch(f32x16, 3)
     for i in range(first, last, 16):
         many = min(last - i, 16)
         load_triples(means, i, many, w)
@@ -132,13 +137,15 @@ def drawn(rows, stored, drawing, w):
     Activated ones stay as they are.
     """
     dial = drawing.dial
-    opacity, size = gather(stored.opacities, rows), splat(0)
+    opacity = gather(stored.opacities, rows)
+    size = splat(0)
     if dial[ACTIVATED] > 0:
         return opacity
     opacity = 1 / reciprocal_opacity(opacity)
     if drawing.fades:
         distance2 = squared_distance(w, drawing.cam)
-        reach, far2 = gather(stored.sigma, rows), distance2 * dial[RATE2]
+        reach = gather(stored.sigma, rows)
+        far2 = distance2 * dial[RATE2]
         share2 = squared_share(reach, far2)
         fade = 1 - share2 * share2
         if dial[NEAR2] > 0:
@@ -186,7 +193,8 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
         for k in range(V_SCALE, V_SCALE + 3):
             g[k] = g[k] * w[SCALE + k - V_SCALE]
     if drawing.fades:
-        reach, distance2 = gather(stored.sigma, rows), squared_distance(w, drawing.cam)
+        reach = gather(stored.sigma, rows)
+        distance2 = squared_distance(w, drawing.cam)
         share2 = squared_share(reach, distance2 * dial[RATE2])
         share4 = share2 * share2
         fading = both(gt(share4, 0), gt(1, share4))

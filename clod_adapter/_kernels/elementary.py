@@ -23,8 +23,10 @@ def _constant(value: float) -> ir.Constant:
     return ir.Constant(VECTOR if isinstance(value, float) else INTEGERS, [value] * LANES)
 
 
-vsqrt, vabs = llvm_function("sqrt", 1), llvm_function("fabs", 1)
-vfloor, vceil = llvm_function("floor", 1), llvm_function("ceil", 1)
+vsqrt = llvm_function("sqrt", 1)
+vabs = llvm_function("fabs", 1)
+vfloor = llvm_function("floor", 1)
+vceil = llvm_function("ceil", 1)
 
 
 # Minimax polynomial of 2^f on [-0.5, 0.5] with p(0) = 1: relative error 9e-8, in float32 arithmetic

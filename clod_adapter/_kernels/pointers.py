@@ -24,7 +24,9 @@ from clod_adapter._kernels.simd import (
     store,
 )
 
-I32, I64, NOTHING = ir.IntType(32), ir.IntType(64), ir.VoidType()
+I32 = ir.IntType(32)
+I64 = ir.IntType(64)
+NOTHING = ir.VoidType()
 FLOATS = types.CPointer(float32)
 NUMBERS = types.CPointer(types.int64)
 VECTORS = types.CPointer(f32x16)
@@ -242,7 +244,8 @@ def load_triples(source, row, count, lanes):
 @operation(types.none, FLOATS, types.int64, *[f32x16] * 9)
 def store_sums(builder, values, index, *given):
     """``values[index : index + 9]`` = the sums over the lanes of the nine vectors."""
-    vectors, nine = list(given), _first(builder, ir.Constant(I64, len(given)))
+    vectors = list(given)
+    nine = _first(builder, ir.Constant(I64, len(given)))
     even, odd = (ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))) for k in range(2))
     while len(vectors) > 1:  # adds neighbouring lanes until one vector holds all the sums, in order
         vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors

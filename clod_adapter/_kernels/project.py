@@ -204,7 +204,9 @@ def add_records(rows, filled, at, spare, means, opacity, cam, w, packed):
 
     ``w`` holds what is stored of the rows. Returns the number of the next record.
     """
-    record, centre, targets = scratch(f32x16, RECORD), scratch(float32, 48), scratch(int64, 16)
+    record = scratch(f32x16, RECORD)
+    centre = scratch(float32, 48)
+    targets = scratch(int64, 16)
     valid = covariance(cam, w)
     centres(means, rows, cam, centre)
     # beyond the near plane in float32 too, not only in float64
@@ -227,8 +229,12 @@ def project(worker, workers, stored, drawing, packed):
     """Packs this worker's visible Gaussians."""
     n = len(stored.opacities)
     first, last = share(worker, workers, n)
-    stored, drawing, packed = pointers(stored), pointers(drawing), pointers(packed)
-    w, rows, queue = scratch(f32x16, WORKSPACE), scratch(int64, 16), scratch(int64, 32)
+    stored = pointers(stored)
+    drawing = pointers(drawing)
+    packed = pointers(packed)
+    w = scratch(f32x16, WORKSPACE)
+    rows = scratch(int64, 16)
+    queue = scratch(int64, 32)
     i = at = first
     queued = 0
     while i < last or queued > 0:

@@ -213,17 +213,26 @@ def project_gradient(
     compensation. Empty gradients of means, quats and scales are skipped together, and empty ones of
     sh0 or shN each.
     """
-    w, g = scratch(f32x16, WORKSPACE), scratch(f32x16, GRADIENTS)
-    sh, basis = scratch(f32x16, 80), scratch(f32x16, 25)
-    rows, places, lanes = scratch(int64, 16), scratch(int64, 16), scratch(int64, 16)
+    w = scratch(f32x16, WORKSPACE)
+    g = scratch(f32x16, GRADIENTS)
+    sh = scratch(f32x16, 80)
+    basis = scratch(f32x16, 25)
+    rows = scratch(int64, 16)
+    places = scratch(int64, 16)
+    lanes = scratch(int64, 16)
     sums = scratch(float32, 256)
-    shaped, colored = len(gradients.means) > 0, len(gradients.sh0) > 0
+    shaped = len(gradients.means) > 0
+    colored = len(gradients.sh0) > 0
     tuned = len(gradients.shN) > 0
     terms = (drawing.degree + 1) * (drawing.degree + 1) - 1 if tuned else 0
     first, last = share(worker, workers, len(stored.opacities))
     end = first + packed.counts[worker]
-    stored, drawing, packed = pointers(stored), pointers(drawing), pointers(packed)
-    slots, pair_sums, gradients = pointer(slots), pointer(pair_sums), pointers(gradients)
+    stored = pointers(stored)
+    drawing = pointers(drawing)
+    packed = pointers(packed)
+    slots = pointer(slots)
+    pair_sums = pointer(pair_sums)
+    gradients = pointers(gradients)
     while end > first and packed.ids[end - 1] >= trained:
         end -= 1
     clear(gradients.sigma, first, last, int64(drawing.fades))

@@ -32,7 +32,8 @@ def _vector_type(name: str, llvm: ir.Type) -> types.Type:
     return kind(name=name)
 
 
-f32x16, mask16 = _vector_type("F32x16", VECTOR), _vector_type("Mask16", MASK)
+f32x16 = _vector_type("F32x16", VECTOR)
+mask16 = _vector_type("Mask16", MASK)
 
 
 def call_llvm(builder, name, result, arguments):
@@ -164,7 +165,8 @@ splat = operation(f32x16, f32x16)(lambda builder, vector: vector)
 fma = llvm_function("fmuladd", 3)
 
 _pair = f32x16, f32x16
-_compare, _extremum = operation(mask16, *_pair), operation(f32x16, *_pair)
+_compare = operation(mask16, *_pair)
+_extremum = operation(f32x16, *_pair)
 ge = _compare(lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
 gt = _compare(lambda builder, a, b: builder.fcmp_ordered(">", a, b))
 eq = _compare(lambda builder, a, b: builder.fcmp_ordered("==", a, b))

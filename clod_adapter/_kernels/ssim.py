@@ -17,7 +17,8 @@ from clod_adapter._kernels.simd import fma, load, splat, store
 RADIUS, PAD = 5, 16
 _taps = np.exp(-((np.arange(11) - RADIUS) ** 2) / (2 * 1.5**2))
 TAPS = (_taps / _taps.sum()).astype(np.float32)
-C1, C2 = float32(0.01**2), float32(0.03**2)
+C1 = float32(0.01**2)
+C2 = float32(0.03**2)
 BYTE = float32(1 / 255)
 
 
@@ -39,7 +40,8 @@ def stride(width: int) -> int:
 @kernel
 def to_planes(worker, workers, image, target, planes):
     """Copies two ``[H, W, 3]`` images into planes; the uint8 ``target`` is scaled to [0, 1]."""
-    height, width = image.shape[0], image.shape[1]
+    height = image.shape[0]
+    width = image.shape[1]
     for row in range(*share(worker, workers, height)):
         for column in range(width):
             for channel in range(3):
@@ -64,15 +66,19 @@ def ssim_slopes(worker, workers, planes, width, sums):
     """
     channels, height, step = planes.x.shape
     planes = pointers(planes)
-    lines, zero = np.zeros(6 * step, np.float32), splat(0)
+    lines = np.zeros(6 * step, np.float32)
+    zero = splat(0)
     result = 0.0
     for task in range(*share(worker, workers, channels * height)):
-        channel, row = task // height, task % height
+        channel = task // height
+        row = task % height
         for at in range(PAD, step - PAD, 16):
             m_x = m_y = m_xx = m_yy = m_xy = zero
             for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
-                tap, where = TAPS[near - row + RADIUS], (channel * height + near) * step + at
-                p, q = load(planes.x, where), load(planes.y, where)
+                tap = TAPS[near - row + RADIUS]
+                where = (channel * height + near) * step + at
+                p = load(planes.x, where)
+                q = load(planes.y, where)
                 tp, tq = tap * p, tap * q
                 m_x, m_y = m_x + tp, m_y + tq
                 m_xx, m_yy, m_xy = fma(tp, p, m_xx), fma(tq, q, m_yy), fma(tp, q, m_xy)
@@ -110,19 +116,21 @@ def loss_gradient(worker, workers, planes, width, l1, dssim, v_image, sums):
     """
     channels, height, step = planes.x.shape
     planes = pointers(planes)
-    lines, out, zero = np.zeros(3 * step, np.float32), np.empty(step, np.float32), splat(0)
+    lines = np.zeros(3 * step, np.float32)
+    out = np.empty(step, np.float32)
+    zero = splat(0)
     weight = float32(-dssim)
     result = 0.0
     for task in range(*share(worker, workers, channels * height)):
-        channel, row = task // height, task % height
+        channel = task // height
+        row = task % height
         for at in range(PAD, step - PAD, 16):
             m, s, p = zero, zero, zero
             for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
-                tap, where = TAPS[near - row + RADIUS], (channel * height + near) * step + at
-                m, s = (
-                    fma(tap, load(planes.mean, where), m),
-                    fma(tap, load(planes.square, where), s),
-                )
+                tap = TAPS[near - row + RADIUS]
+                where = (channel * height + near) * step + at
+                m = fma(tap, load(planes.mean, where), m)
+                s = fma(tap, load(planes.square, where), s)
                 p = fma(tap, load(planes.product, where), p)
             store(lines, at, m)
             store(lines, step + at, s)

@@ -67,7 +67,8 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):
     Worker w packed the first ``counts[w]`` of its part of ``depths [N]``, as uint32; the others are
     scratch.
     """
-    digits, n = np.zeros((3, 2048), np.int64), 0
+    digits = np.zeros((3, 2048), np.int64)
+    n = 0
     for worker in range(len(counts)):
         first = len(depths) * worker // len(counts)
         for k in range(first, first + counts[worker]):
@@ -97,7 +98,8 @@ def tiles_across(records, r, ty, y0, y1, columns):
 
     ``columns [32]`` keeps those of sixteen rows, for calls with ascending ``ty``.
     """
-    first, last = np.int32(records[r + X0]) // TILE, np.int32(records[r + X1]) // TILE
+    first = np.int32(records[r + X0]) // TILE
+    last = np.int32(records[r + X1]) // TILE
     lane = (ty - y0 // TILE) % 16
     if first < last or y0 // TILE < y1 // TILE:
         if lane == 0:
@@ -139,8 +141,11 @@ def list_tiles(
     cursor = pointer(histogram[worker])
     records = pointer(records)
     order = pointer(order)
-    slots, entries, entry_slots = pointer(slots), pointer(entries), pointer(entry_slots)
-    columns, slot = scratch(float32, 32), totals[worker]
+    slots = pointer(slots)
+    entries = pointer(entries)
+    entry_slots = pointer(entry_slots)
+    columns = scratch(float32, 32)
+    slot = totals[worker]
     for j in range(first, last):
         prefetch(records, order[min(j + AHEAD, last - 1)] * RECORD)
         p = order[j]
