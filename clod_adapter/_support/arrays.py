@@ -1,4 +1,4 @@
-"""Arrays of numpy as tensors, where the library is called with them."""
+"""Arrays of numpy as tensors, and tensors as arrays."""
 
 from typing import Any
 
@@ -22,3 +22,8 @@ def float_tensor(values: Any) -> Tensor:
     is float64.
     """
     return values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, np.float32))
+
+
+def float64_array(tensor: Tensor) -> np.ndarray:
+    """The values on the host, in float64; shared with a tensor that is there in float64."""
+    return tensor.detach().double().cpu().numpy()  # type: ignore[no-any-return]

@@ -31,6 +31,7 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
+from clod_adapter._support.arrays import float64_array
 from clod_adapter.cameras import Camera
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
@@ -143,14 +144,15 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
     if len(cameras) < 2:
         raise ClodError(f"a camera path needs at least two cameras, not {len(cameras)}")
     first = cameras[0]
-    viewmats = np.stack([camera.viewmat.detach().double().cpu().numpy() for camera in cameras])
+    viewmats = np.stack([float64_array(camera.viewmat) for camera in cameras])
     centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     lengths = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     lengths = np.maximum(lengths, 1e-9 * lengths.sum() or 1.0)
     places = np.concatenate([[0.0], lengths.cumsum()])
     at = np.linspace(0, places[-1], steps + 1)
     poses = np.tile(np.eye(4), (steps + 1, 1, 1))
-    poses[:, :3, :3] = Slerp(places, Rotation.from_matrix(viewmats[:, :3, :3]))(at).as_matrix()
+    rotations = Slerp(places, Rotation.from_matrix(viewmats[:, :3, :3]))
+    poses[:, :3, :3] = rotations(at).as_matrix()
     moved = np.stack([np.interp(at, places, axis) for axis in centres.T], 1)
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], moved)
     path_viewmats = torch.from_numpy(poses).to(first.viewmat)
@@ -162,7 +164,9 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
 
 def _change(delta: Tensor) -> tuple[float, float]:
     """Root mean square, and largest absolute value, in levels of 255."""
-    return 255 * float(delta.square().mean().sqrt()), 255 * float(delta.abs().max())
+    root_mean_square = float(delta.square().mean().sqrt())
+    largest = float(delta.abs().max())
+    return 255 * root_mean_square, 255 * largest
 
 
 def _ratio(numerator: float, denominator: float) -> float:

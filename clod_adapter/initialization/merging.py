@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from clod_adapter._support.arrays import float64_array
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.neighbours import nearest, without_crowds
 from clod_adapter.progress import Listener, Phase, tell
@@ -77,11 +78,12 @@ def merge(
     """
     mixture = mixture_of(gaussians)
     before = len(gaussians)
-    weights = importance.detach().double().cpu().numpy()
+    weights = float64_array(importance)
     # of what no view shows, the most similar are merged first
     weights = weights + LEAST * weights.mean()
     while len(mixture) > count:
-        groups = _groups(mixture, weights, max(count, int((1 - ROUND) * len(mixture))))
+        least = int((1 - ROUND) * len(mixture))
+        groups = _groups(mixture, weights, max(count, least))
         if groups.max() + 1 == len(mixture):
             break
         mixture = mixture.merged(groups)
@@ -91,18 +93,14 @@ def merge(
 
 
 def mixture_of(gaussians: Gaussians) -> Mixture:
-    scales = gaussians.log_scales.detach().double().exp().cpu().numpy()
-    axes = _rotations(gaussians.quats.detach().double().cpu().numpy())
+    scales = float64_array(gaussians.log_scales.double().exp())
+    axes = _rotations(float64_array(gaussians.quats))
     full = np.einsum("nij,nj,nkj->nik", axes, scales**2, axes)
     covariances = np.stack([full[:, i, j] for i, j in _ENTRIES], 1)
-    mass = gaussians.opacities.detach().double().cpu().numpy() * _areas(scales)
-    bands = [
-        x.detach().float().cpu().numpy().reshape(len(x), -1)
-        for x in (gaussians.sh0, gaussians.shN)
-        if x.numel()
-    ]
-    means = gaussians.means.detach().double().cpu().numpy()
-    return Mixture(mass + np.finfo(np.float32).tiny, means, covariances, np.concatenate(bands, 1))
+    mass = float64_array(gaussians.opacities) * _areas(scales) + np.finfo(np.float32).tiny
+    coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1).detach().float().cpu()
+    harmonics = coefficients.flatten(1).numpy()
+    return Mixture(mass, float64_array(gaussians.means), covariances, harmonics)
 
 
 def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
@@ -123,10 +121,10 @@ def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
         "sh0": harmonics[:, :1],
         "shN": harmonics[:, 1:],
     }
-    tensors = {
-        name: torch.from_numpy(np.ascontiguousarray(x, np.float32)) for name, x in arrays.items()
-    }
-    fields: Any = {name: x.to(like.means) for name, x in tensors.items()}
+    fields: Any = {}
+    for name, array in arrays.items():
+        tensor = torch.from_numpy(np.ascontiguousarray(array, np.float32))
+        fields[name] = tensor.to(like.means)
     return Gaussians(**fields, screen_filter=like.screen_filter)
 
 
@@ -145,7 +143,8 @@ def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
         remaining -= len(first[pairs])
         if remaining <= count:
             break
-    return np.unique(np.minimum(np.arange(len(mixture)), partner), return_inverse=True)[1]
+    first_rows = np.minimum(np.arange(len(mixture)), partner)
+    return np.unique(first_rows, return_inverse=True)[1]
 
 
 def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -153,9 +152,8 @@ def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarra
     what remains.
     """
     i, j = _neighbours(mixture)
-    weight = np.sqrt(
-        weights[i] * weights[j] / np.maximum(weights[i] + weights[j], np.finfo(float).tiny)
-    )
+    total = np.maximum(weights[i] + weights[j], np.finfo(float).tiny)
+    weight = np.sqrt(weights[i] * weights[j] / total)
     order = np.argsort((_cost(mixture, i, j) + LEAST) * weight, kind="stable")
     i = i[order]
     j = j[order]
@@ -199,9 +197,8 @@ def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray
         merged = p * mixture.covariances[i].T + q * mixture.covariances[j].T
         merged += p * q * _products((mixture.means[i] - mixture.means[j]).T)
         shape = _log_determinants(merged) - p * entropy[i] - q * entropy[j]
-        cost[block] = shape / 2 + COLOUR * np.square(
-            mixture.harmonics[i] - mixture.harmonics[j]
-        ).sum(1)
+        colours = mixture.harmonics[i] - mixture.harmonics[j]
+        cost[block] = shape / 2 + COLOUR * np.square(colours).sum(1)
     return cost
 
 

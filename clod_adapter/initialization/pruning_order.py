@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.config import AttenuationConfig
+from clod_adapter._support.arrays import float64_array
 from clod_adapter.equation.attenuation import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
@@ -57,13 +57,13 @@ def pruning_order(
     if not bool(gaussians.means.isfinite().all()):
         raise ClodError("means are not all finite, so neighbours are not defined; remove such rows")
     count = len(gaussians)
-    colours = 0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].double().cpu().numpy()
-    sizes = (
-        gaussians.log_scales.detach().double().exp().amax(1).cpu().numpy() if count else np.empty(0)
-    )
-    weights = importance.detach().double().cpu().numpy().copy()
+    colours = 0.5 + SH_C0 * float64_array(gaussians.sh0[:, 0])
+    sizes = np.empty(0)
+    if count:
+        sizes = float64_array(gaussians.log_scales.double().exp().amax(1))
+    weights = float64_array(importance).copy()
     order = np.empty(count, np.int64)
-    centres = without_crowds(gaussians.means.detach().double().cpu().numpy(), sizes)
+    centres = without_crowds(float64_array(gaussians.means), sizes)
     favoured = np.arange(count)
     remaining = np.arange(count)
     removed_count = 0
@@ -80,9 +80,8 @@ def pruning_order(
         tell(progress, Phase.PRUNING_ORDER, removed_count, count)
     order[remaining] = removed_count
     tell(progress, Phase.PRUNING_ORDER, count, count)
-    return PruningOrder(
-        *(torch.from_numpy(rows).to(importance.device) for rows in (order, favoured))
-    )
+    device = importance.device
+    return PruningOrder(torch.from_numpy(order).to(device), torch.from_numpy(favoured).to(device))
 
 
 def _removed(cost: np.ndarray, substitute: np.ndarray) -> np.ndarray:
@@ -150,25 +149,22 @@ def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor)
     ``h log m(s) = log(sum of A / own A) / 2`` over the dial values at which it is kept, times
     SHARE.
     """
-    config: AttenuationConfig | None = gaussians.attenuation
+    config = gaussians.attenuation
     assert config is not None and gaussians.sigma_d is not None
     scales = gaussians.log_scales.double().sort(1).values
     area = gaussians.opacities.double() * (scales[:, 1] + scales[:, 2]).exp()
     extinction = gaussians.sigma_d / distances
+    unit_growth = torch.ones_like(distances)
+    start = growth_distance(config)
     total = torch.zeros_like(area)
     weight = torch.zeros_like(area)
     for k in range(1, DIALS):
         s = config.max_sv ** (k / (DIALS - 1))
         kept = extinction > s
-        covered_area = torch.zeros_like(area).index_add_(
-            0, _kept_substitutes(kept, substitutes), area
-        )
+        receivers = _kept_substitutes(kept, substitutes)
+        covered_area = torch.zeros_like(area).index_add_(0, receivers, area)
         needed = (covered_area / area).clamp(min=1).log().div_(2).nan_to_num_(0.0, 0.0)
-        available = (
-            growth_factors(torch.ones_like(distances), distances, s, growth_distance(config))
-            .double()
-            .log()
-        )
+        available = growth_factors(unit_growth, distances, s, start).double().log()
         total += kept * needed * available
         weight += kept * available.square()
     exponents = (total / weight.clamp(min=1e-12)).clamp_(0, MOST)

@@ -16,6 +16,7 @@ from clod_adapter._kernels.conventions import Drawing, Packed, Picture, Stored, 
 from clod_adapter._kernels.memory import recycled, recycled_array
 from clod_adapter._kernels.project import project
 from clod_adapter._kernels.project_gradient import project_gradient
+from clod_adapter._support.arrays import float64_array
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.attenuation import check_dial, growth_distance
@@ -32,7 +33,8 @@ FASTEST = 1e18  # rate of a dial, whose square float32 holds
 def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
     """Camera and screen-space filter in the layout of the kernels (``_kernels/conventions.py``)."""
     out = np.empty(conventions.CAMERA, np.float32)
-    viewmat, K = (x.detach().cpu().double().numpy() for x in (camera.viewmat, camera.K))
+    viewmat = float64_array(camera.viewmat)
+    K = float64_array(camera.K)
     fx = float(K[0, 0])
     fy = float(K[1, 1])
     cx = float(K[0, 2])
@@ -236,7 +238,8 @@ class _Compiled(Rasterizer):
             )
         check_dial(virtual_scale)
         g = gaussians
-        sigma_d, growth_d = (NOTHING if x is None else x.float() for x in (g.sigma_d, g.growth_d))
+        sigma_d = NOTHING if g.sigma_d is None else g.sigma_d.float()
+        growth_d = NOTHING if g.growth_d is None else g.growth_d.float()
         require_float32(
             "CPU",
             **(g.tensors() | {"sigma_d": sigma_d, "growth_d": growth_d, "background": background}),

@@ -25,6 +25,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
+from clod_adapter._support.arrays import float64_array
 from clod_adapter._support.text import as_text, script_json
 from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera, looking
@@ -138,9 +139,10 @@ def _along_curve(means: Tensor) -> Tensor:
     """The rows in Morton order, of cells that divide all but the outermost 1 % on each side by
     1024.
     """
-    points = means.detach().double().cpu().numpy()
+    points = float64_array(means)
     low, high = np.quantile(points, (0.01, 0.99), axis=0)
-    cells = (1023 * (points - low) / np.maximum(high - low, 1e-300)).clip(0, 1023).astype(np.int64)
+    places = 1023 * (points - low) / np.maximum(high - low, 1e-300)
+    cells = places.clip(0, 1023).astype(np.int64)
     code = sum(
         ((cells[:, k] >> bit) & 1) << (3 * bit + k) for bit, k in product(range(10), range(3))
     )
@@ -254,7 +256,7 @@ def levelled(camera: Camera, axis: np.ndarray) -> Camera:
 def up_axis(gaussians: Gaussians) -> np.ndarray:
     """The direction that flat Gaussians face, a ground or a table, as in web/src/model.js."""
     g = gaussians.to("cpu")
-    means = g.means.double().numpy()
+    means = float64_array(g.means)
     scales = np.sort(g.log_scales.numpy(), axis=1)
     offsets = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     flat = (scales[:, 0] + FLAT < scales[:, 1]) & (offsets <= np.quantile(offsets, 0.98))
@@ -263,7 +265,7 @@ def up_axis(gaussians: Gaussians) -> np.ndarray:
     axes = rotations(g.quats[torch.from_numpy(flat)].double()).numpy()
     thin = g.log_scales.numpy()[flat].argmin(axis=1)
     normals = axes[np.arange(len(axes)), :, thin]
-    weights = g.opacities.double().numpy()[flat]
+    weights = float64_array(g.opacities)[flat]
     for up in np.array(UPS):
         for _ in range(UP_STEPS):
             cosines = normals @ up

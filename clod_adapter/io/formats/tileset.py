@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from clod_adapter._support.arrays import float64_array
 from clod_adapter._support.text import package_version
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import spz
@@ -55,7 +56,7 @@ def write_tileset(
     notes: list[str] = []
     errors = [ALLOWED / FOCAL * begins for begins, _ in levels]
     detail = [gaussians for _, gaussians in levels]
-    centres = [level.means.cpu().double().numpy() for level in detail]
+    centres = [float64_array(level.means) for level in detail]
 
     def tile(level: int, rows: Rows, name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
         """A tile and its file; without one where it has no Gaussians."""
