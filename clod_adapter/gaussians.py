@@ -123,11 +123,9 @@ class Gaussians:
             return NotImplemented
         mine = self.tensors()
         theirs = other.tensors()
-        if (mine.keys(), self.attenuation, self.screen_filter) != (
-            theirs.keys(),
-            other.attenuation,
-            other.screen_filter,
-        ):
+        if mine.keys() != theirs.keys() or self.attenuation != other.attenuation:
+            return False
+        if self.screen_filter != other.screen_filter:
             return False
         pairs = [(mine[name], theirs[name]) for name in mine]
         return all(
@@ -218,10 +216,9 @@ class Gaussians:
 
     def without_bands(self, degree: int) -> Gaussians:
         """A copy without the SH degrees above ``degree``; itself if it has none."""
-        above = degree < self.sh_degree
-        return (
-            self.replace(shN=self.shN[:, : SH_COUNTS[degree] - 1].contiguous()) if above else self
-        )
+        if degree >= self.sh_degree:
+            return self
+        return self.replace(shN=self.shN[:, : SH_COUNTS[degree] - 1].contiguous())
 
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""
@@ -256,9 +253,11 @@ def nonfinite_rows(gradients: dict[str, Tensor]) -> Tensor:
     if tensors[0].device.type == "cpu" and all(bool(tensor.sum().isfinite()) for tensor in tensors):
         # A GPU is not asked: the host would wait for its answer.
         return torch.zeros(len(tensors[0]), dtype=torch.bool, device="cpu")
-    return torch.stack(
-        [~each.isfinite().reshape(len(each), each.shape[1:].numel()).all(1) for each in tensors]
-    ).any(0)
+    rows = []
+    for tensor in tensors:
+        finite = tensor.isfinite().reshape(len(tensor), tensor.shape[1:].numel())
+        rows.append(~finite.all(1))
+    return torch.stack(rows).any(0)
 
 
 def require_finite(gaussians: Gaussians, what: str, remedy: str) -> None:
@@ -293,7 +292,8 @@ def with_near(near: Gaussians, far: Gaussians) -> Gaussians:
     The result has the SH degree of ``near``, which is that of ``far`` or a higher one.
     """
     joined = far.tensors()
-    joined["shN"] = pad(far.shN, (0, 0, 0, near.shN.shape[1] - far.shN.shape[1]))
+    missing = near.shN.shape[1] - far.shN.shape[1]
+    joined["shN"] = pad(far.shN, (0, 0, 0, missing))
     for name, value in joined.items():
         dial = name in ("sigma_d", "growth_d")
         first = near.means.new_zeros(len(near)) if dial else getattr(near, name)

@@ -23,8 +23,8 @@ def psnr(image: Tensor, target: Tensor) -> float:
     ``-10 log10 mean (image - target)^2``; infinite for equal images, NaN if a pixel of the render
     is NaN.
     """
-    error = float((image.detach().clamp(0, 1) - unit(target, image)).double().square().mean())
-    return decibels(error)
+    difference = image.detach().clamp(0, 1) - unit(target, image)
+    return decibels(float(difference.double().square().mean()))
 
 
 def decibels(error: float) -> float:
@@ -78,7 +78,8 @@ def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
     mx, my = blurred[:6].split(3)
     xx, yy, xy = blurred[6:].split(3)
     similarity = (2 * mx * my + C1) * (2 * (xy - mx * my) + C2)
-    return (similarity / ((mx * mx + my * my + C1) * (xx - mx * mx + yy - my * my + C2))).mean()
+    largest = (mx * mx + my * my + C1) * (xx - mx * mx + yy - my * my + C2)
+    return (similarity / largest).mean()
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
@@ -89,10 +90,10 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     """
     if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FusedLoss.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]
-    target_image = unit(target, image)
-    return (1 - ssim_weight) * (image - target_image).abs().mean() + ssim_weight * (
-        1 - ssim_plain(image, target_image)
-    )
+    photograph = unit(target, image)
+    l1 = (image - photograph).abs().mean()
+    dissimilarity = 1 - ssim_plain(image, photograph)
+    return (1 - ssim_weight) * l1 + ssim_weight * dissimilarity
 
 
 def unit(photograph: Tensor, like: Tensor) -> Tensor:
@@ -113,7 +114,8 @@ class _FusedLoss(torch.autograd.Function):
 
         l1 = (1 - ssim_weight) / image.numel()
         dssim = ssim_weight / image.numel()
-        (height, width, _), workers = image.shape, threads.worker_count()
+        height, width, _ = image.shape
+        workers = threads.worker_count()
         shape = (3, height, kernels.stride(width))
         planes = kernels.Planes(*(recycled(shape).numpy() for _ in range(5)))
         for plane in (planes.x, planes.y):

@@ -122,14 +122,17 @@ def compare_renders(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
             continue
         rendering = render(gaussians, view.camera)
         black = rendering.image.clamp(0, 1)
-        white = (rendering.image + (1 - rendering.alpha)[..., None]).clamp(0, 1)
+        background = (1 - rendering.alpha)[..., None]
+        white = (rendering.image + background).clamp(0, 1)
         centred = black - black.mean((0, 1))
-        errors = [(black - photograph).square(), (white - photograph).square(), deviation.square()]
-        rows.append(
-            torch.stack(
-                [values.mean() for values in (*errors, centred.square(), centred * deviation)]
-            )
+        columns = (
+            (black - photograph).square(),
+            (white - photograph).square(),
+            deviation.square(),
+            centred.square(),
+            centred * deviation,
         )
+        rows.append(torch.stack([values.mean() for values in columns]))
     return torch.stack(rows) if rows else gaussians.means.new_empty(0, 5)
 
 
@@ -153,25 +156,25 @@ def compare_filters(
     """
     views = spread(views, MOST_VIEWS)
     photographs = [unit(view.image, gaussians.means) for view in views]
-    constant = fmean(float((image - image.mean((0, 1))).square().mean()) for image in photographs)
-
-    def errors(filtered: Gaussians) -> Tensor:
-        pairs = zip(photographs, views, strict=True)
-        return torch.stack(
-            [(render(filtered, v.camera).image.clamp(0, 1) - p).square().mean() for p, v in pairs]
-        )
-
-    error = torch.stack(
-        [
-            errors(gaussians.replace(screen_filter=screen_filter))
-            for screen_filter in FILTERS.values()
-        ]
-    )
+    deviations = [photograph - photograph.mean((0, 1)) for photograph in photographs]
+    constant = fmean(float(deviation.square().mean()) for deviation in deviations)
+    rows = []
+    for screen_filter in FILTERS.values():
+        filtered = gaussians.replace(screen_filter=screen_filter)
+        errors = []
+        for view, photograph in zip(views, photographs, strict=True):
+            image = render(filtered, view.camera).image.clamp(0, 1)
+            errors.append((image - photograph).square().mean())
+        rows.append(torch.stack(errors))
+    error = torch.stack(rows)
     psnr = -10 * error.clamp(min=1e-10).log10()
     names = list(FILTERS)
     gained = psnr - psnr[names.index(expected)]
     means = psnr.mean(1)
-    clear = (gained.mean(1) > CLEAR_FILTER) & ((gained > 0).float().mean(1) >= MOST)
+    clear = gained.mean(1) > CLEAR_FILTER
+    clear &= (gained > 0).float().mean(1) >= MOST
     clear &= error.mean(1) < constant * 10 ** (-DOUBTFUL / 10)
-    best = names[int(means.where(clear, -math.inf).argmax())] if bool(clear.any()) else expected
+    best = expected
+    if bool(clear.any()):
+        best = names[int(means.where(clear, -math.inf).argmax())]
     return best, dict(zip(names, means.tolist(), strict=True))

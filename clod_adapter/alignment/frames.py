@@ -105,8 +105,9 @@ def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) 
     ``x_cameras = scale rotation x_file + offset``.
     """
     out = viewmats.clone()
-    out[:, :3, :3] = viewmats[:, :3, :3] @ rotation
-    out[:, :3, 3] = (viewmats[:, :3, :3] @ offset + viewmats[:, :3, 3]) / scale
+    turns = viewmats[:, :3, :3]
+    out[:, :3, :3] = turns @ rotation
+    out[:, :3, 3] = (turns @ offset + viewmats[:, :3, 3]) / scale
     return out
 
 
@@ -120,15 +121,18 @@ def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
     poses = torch.linalg.inv(viewmats.double())
     centres = poses[:, :3, 3]
     forward = poses[:, :3, 2]
-    across = torch.eye(3, dtype=poses.dtype) - forward[:, :, None] * forward[:, None, :]
+    along = forward[:, :, None] * forward[:, None, :]
+    across = torch.eye(3, dtype=poses.dtype) - along
     if float(torch.linalg.cond(across.mean(0))) > 1e4:
         return centres.mean(0)
     weights = across.new_ones(len(across))
     for _ in range(rounds):
         rows = weights[:, None, None] * across
-        focus = torch.linalg.solve(rows.mean(0), (rows @ centres[:, :, None]).mean(0))[:, 0]
+        products = (rows @ centres[:, :, None]).mean(0)
+        focus = torch.linalg.solve(rows.mean(0), products)[:, 0]
         away = (across @ (focus - centres)[:, :, None]).flatten(1).norm(dim=1)
-        weights = 1 / away.clamp(min=max(0.01 * float(away.median()), 1e-9))
+        least = max(0.01 * float(away.median()), 1e-9)
+        weights = 1 / away.clamp(min=least)
     return focus
 
 
@@ -162,11 +166,11 @@ def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
         centres = poses[:, :3, 3] @ turn.T
         up = turn @ -poses[:, :3, 1].mean(0)
         rotation = _turning(up, viewmats.new_tensor([0.0, 0, 1]))
-        farthest = float(((centres - centres.mean(0)) @ rotation.T).abs().max())
+        middle = centres.mean(0)
+        farthest = float(((centres - middle) @ rotation.T).abs().max())
         if farthest > 0:
-            yield _normalized(
-                "nerfstudio", NERFSTUDIO, rotation @ turn, 1 / farthest, -rotation @ centres.mean(0)
-            )
+            offset = -rotation @ middle
+            yield _normalized("nerfstudio", NERFSTUDIO, rotation @ turn, 1 / farthest, offset)
 
 
 def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
@@ -174,11 +178,13 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     the points.
     """
     poses = torch.linalg.inv(viewmats)
-    rotation = _turning(-poses[:, :3, 1].mean(0), viewmats.new_tensor([0.0, -1, 0]))
+    up = -poses[:, :3, 1].mean(0)
+    rotation = _turning(up, viewmats.new_tensor([0.0, -1, 0]))
     centres = poses[:, :3, 3] @ rotation.T
     forward = poses[:, :3, 2] @ rotation.T
     # quantile(0.5) is numpy's median; torch's takes the lower of two
-    focus = (centres - (forward * centres).sum(1, keepdim=True) * forward).quantile(0.5, dim=0)
+    depths = (forward * centres).sum(1, keepdim=True)
+    focus = (centres - depths * forward).quantile(0.5, dim=0)
     distance = float((centres - focus).norm(dim=1).quantile(0.5))
     if distance == 0:
         return
@@ -187,7 +193,8 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
         return
     turned = points.to(viewmats) @ rotation.T
     middle = turned.quantile(0.5, dim=0)
-    axes = torch.linalg.eigh((turned - middle).T.cov()).eigenvectors.flip(1).T
+    covariance = (turned - middle).T.cov()
+    axes = torch.linalg.eigh(covariance).eigenvectors.flip(1).T
     axes = axes * torch.linalg.det(axes).sign()
     # eigenvectors have no sign
     for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):
@@ -211,7 +218,9 @@ def _turning(source: Tensor, target: Tensor) -> Tensor:
     identity = torch.eye(3, dtype=a.dtype)
     cosine = float(a @ b)
     if cosine < -1 + 1e-8:
-        across = F.normalize(torch.linalg.cross(b, identity[int(b.abs().argmin())]), dim=0)
+        axis = identity[int(b.abs().argmin())]
+        across = F.normalize(torch.linalg.cross(b, axis), dim=0)
         return 2 * torch.outer(across, across) - identity
-    skew = torch.linalg.cross(identity, torch.linalg.cross(a, b).expand(3, 3))
+    normal = torch.linalg.cross(a, b)
+    skew = torch.linalg.cross(identity, normal.expand(3, 3))
     return identity + skew + skew @ skew / (1 + cosine)

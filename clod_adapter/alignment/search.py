@@ -67,11 +67,9 @@ def guess_frame(
     def measured(frame: Frame) -> Guess | None:
         psnr = check_alignment(gaussians, views_in(views, frame)).psnr
         enough = max(alignment.mean_colour_psnr + BETTER_THAN_MEAN, alignment.psnr + CLEAR)
-        return (
-            Guess(frame, psnr, psnr >= alignment.mean_colour_psnr + DOUBTFUL)
-            if psnr >= enough
-            else None
-        )
+        if not psnr >= enough:
+            return None
+        return Guess(frame, psnr, psnr >= alignment.mean_colour_psnr + DOUBTFUL)
 
     guess = measured(max(known_frames(viewmats, points), key=score))
     if guess:
@@ -93,9 +91,9 @@ def views_in(views: Sequence[View], frame: Frame) -> tuple[View, ...]:
 
 def scene_in(scene: Scene, frame: Frame) -> Scene:
     """The scene with its cameras in the file's frame, and the near planes of that frame's unit."""
-    return in_its_unit(
-        replace(scene, train=views_in(scene.train, frame), test=views_in(scene.test, frame))
-    )
+    train = views_in(scene.train, frame)
+    test = views_in(scene.test, frame)
+    return in_its_unit(replace(scene, train=train, test=test))
 
 
 def _small(
@@ -106,9 +104,8 @@ def _small(
     """
     shrunk = [_shrunk(view, width) for view in spread(views, VIEWS)]
     if len(gaussians) > most:
-        cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(
-            2, dim=1
-        ).values.sum(1)
+        log_areas = gaussians.log_scales.topk(2, dim=1).values.sum(1)
+        cover = F.logsigmoid(gaussians.opacity_logits) + log_areas
         gaussians = gaussians.select(cover.topk(most).indices)
     return lambda frame: correlation(compare_renders(gaussians, views_in(shrunk, frame)))
 
@@ -126,7 +123,8 @@ def _search(
     climbs = []
     for towards, rounds in ((0.0, 1), (1.0, 1), (1.0, ROUNDS)):
         focus = focus_of(viewmats, rounds)
-        unit = float((centres - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
+        distances = (centres - focus).norm(dim=1)
+        unit = float(distances.quantile(0.5).clamp(min=1e-9))
         places = [_placed(scale, towards * (focus - scale * middle)) for scale in SCALES]
         start = max(places, key=score)
         climbs.append((_climb(score, start, focus, unit, (0.1, 0.02)), focus, unit))
@@ -134,7 +132,8 @@ def _search(
     if not best >= LOWEST_CORRELATION:
         return None
     for width, most, steps in FINER:
-        _, frame = _climb(_small(gaussians, views, width, most), frame, focus, unit, steps)
+        score = _small(gaussians, views, width, most)
+        _, frame = _climb(score, frame, focus, unit, steps)
     return frame
 
 
@@ -184,7 +183,6 @@ def _shrunk(view: View, width: int) -> View:
     if camera.width <= width:
         return view
     height = max(1, round(camera.height * width / camera.width))
-    image = F.adaptive_avg_pool2d(view.image.permute(2, 0, 1).float(), (height, width)).permute(
-        1, 2, 0
-    )
-    return View(camera.resized(width, height), image.round().to(torch.uint8))
+    planes = F.adaptive_avg_pool2d(view.image.permute(2, 0, 1).float(), (height, width))
+    image = planes.permute(1, 2, 0).round().to(torch.uint8)
+    return View(camera.resized(width, height), image)

@@ -163,7 +163,8 @@ def takeover(far: Tensor, near: float) -> Tensor:
     """w, in [0, 1]: how far the far Gaussians have taken over from the near ones at d
     s = ``far``.
     """
-    return ((far / near).square() * TAKEOVER - (TAKEOVER - 1)).clamp(0, 1)
+    progress = (far / near).square() * TAKEOVER - (TAKEOVER - 1)
+    return progress.clamp(0, 1)
 
 
 def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:
@@ -200,9 +201,8 @@ def growth_factors(
     ``start`` is r.
     """
     # d s is float64's: a dial beyond float32 times a distance of 0 would be NaN.
-    magnification = (
-        d.detach().double().mul(virtual_scale).div_(start).clamp_(1, torch.finfo(d.dtype).max)
-    )
+    magnification = d.detach().double().mul(virtual_scale).div_(start)
+    magnification.clamp_(1, torch.finfo(d.dtype).max)
     exponents = growth_d.to(d) * magnification.to(d.dtype).log_()
     return exponents.clamp(-LOG_GROWTH_MAX, LOG_GROWTH_MAX).exp()
 
@@ -244,5 +244,6 @@ def conform(**tensors: Tensor) -> list[Tensor]:
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
         listed = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
         raise ClodError(f"expected one shape [N], got {listed}")
-    dtype = reduce(torch.promote_types, (t.dtype for t in tensors.values()), torch.float32)
-    return [t.to(dtype) for t in tensors.values()]
+    dtypes = [tensor.dtype for tensor in tensors.values()]
+    dtype = reduce(torch.promote_types, dtypes, torch.float32)
+    return [tensor.to(dtype) for tensor in tensors.values()]

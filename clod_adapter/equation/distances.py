@@ -71,9 +71,9 @@ def in_frustum(means: Tensor, camera: Camera) -> Tensor:
         means, non_blocking=means.device.type != "cpu"
     )
     x, y, z = projection[:, :3] @ means.T + projection[:, 3:]
-    return (
-        (z > camera.near) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
-    )
+    in_columns = (x >= 0) & (x < camera.width * z)
+    in_rows = (y >= 0) & (y < camera.height * z)
+    return (z > camera.near) & in_columns & in_rows
 
 
 @torch.no_grad()
@@ -123,12 +123,12 @@ def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Vi
 def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> Camera:
     """The camera of a viewpoint that has a direction, for images of this size."""
     v = viewpoint
-    look, up = torch.tensor(
-        [[v.look_x, v.look_y, v.look_z], [v.up_x, v.up_y, v.up_z]], dtype=torch.float64
-    )
+    rows = [[v.x, v.y, v.z], [v.look_x, v.look_y, v.look_z], [v.up_x, v.up_y, v.up_z]]
+    centre, look, up = torch.tensor(rows, dtype=torch.float64)
+    right = torch.linalg.cross(look, up)
     viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.stack([torch.linalg.cross(look, up), -up, look])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([v.x, v.y, v.z], dtype=torch.float64)
+    viewmat[:3, :3] = torch.stack([right, -up, look])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
     focal = 0.5 * height / math.tan(0.5 * v.fov)
     K = torch.tensor(
         [[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]], dtype=torch.float32
@@ -162,7 +162,8 @@ def _without_outliers(means: Tensor, places: Sequence[Place]) -> Sequence[Place]
         return places
     centre = means.median(0).values
     away = torch.stack([(position_of(place, means) - centre).norm() for place in places])
-    limit = OUTLIER * torch.maximum(away.median(), (means - centre).norm(dim=1).median())
+    radius = (means - centre).norm(dim=1).median()
+    limit = OUTLIER * torch.maximum(away.median(), radius)
     return [place for place, distance in zip(places, away, strict=True) if bool(distance <= limit)]
 
 

@@ -44,7 +44,8 @@ def unusable() -> str | None:
         with contextlib.redirect_stdout(sys.stderr):
             import gsplat
 
-            if tuple(int(number) for number in re.findall(r"\d+", gsplat.__version__)[:3]) < OLDEST:
+            numbers = re.findall(r"\d+", gsplat.__version__)
+            if tuple(map(int, numbers[:3])) < OLDEST:
                 return (
                     f"gsplat {gsplat.__version__} is too old, its functions take other arguments:"
                     f" {INSTALL}"
@@ -52,8 +53,8 @@ def unusable() -> str | None:
             from gsplat.cuda import _backend
     # a failed compilation is a RuntimeError, a missing library an OSError or ImportError
     except Exception as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        return f"gsplat cannot be imported ({reason}): {INSTALL}"
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        return f"gsplat cannot be imported ({lines[0]}): {INSTALL}"
     if _backend._C is None:
         return (
             f"gsplat {gsplat.__version__} has no CUDA kernels, and there is no CUDA toolkit to"
@@ -77,11 +78,8 @@ def rasterize(
     """See ``clod_adapter.rasterizers.Splat``; of float32 tensors alone."""
     geometry = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     tensors = geometry | {"sh0": sh0, "shN": shN}
-    on_gpu = {
-        name: tensor
-        for name, tensor in (tensors | {"background": background}).items()
-        if tensor.is_cuda
-    }
+    inputs = tensors | {"background": background}
+    on_gpu = {name: tensor for name, tensor in inputs.items() if tensor.is_cuda}
     require_float32("CUDA", **on_gpu)
     rows = drawable(quats, opacities).nonzero()[:, 0]
     geometry = {name: _Rows.apply(rows, x) for name, x in geometry.items()}
@@ -110,9 +108,8 @@ def _project(
     opacities = geometry["opacities"]
     # In one transfer to the device.
     tensors = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
-    flat = torch.cat([tensor.detach().to(means.dtype) for tensor in tensors]).to(
-        means.device, non_blocking=True
-    )
+    flat = torch.cat([tensor.detach().to(means.dtype) for tensor in tensors])
+    flat = flat.to(means.device, non_blocking=True)
     viewmat = flat[:16].view(1, 4, 4)
     K = flat[16:25].view(1, 3, 3)
     eye = flat[25:]
@@ -152,7 +149,8 @@ def _project(
     if compensations is not None:
         opacities = opacities * compensations
     # Rows with values that are not finite are not drawn; the kernels would draw them opaque.
-    finite = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + opacities).detach().isfinite()
+    sums = means2d.sum(1) + conics.sum(1) + colors.sum(1) + opacities
+    finite = sums.detach().isfinite()
     finite_rows = finite[:, None]
     return {
         "means2d": means2d.where(finite_rows, 0),

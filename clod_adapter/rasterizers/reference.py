@@ -30,22 +30,23 @@ def rasterize(
     viewmat = camera.viewmat.to(means)
     K = camera.K.to(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    rows = ((points[:, 2] >= camera.near) & drawable(quats, opacities)).nonzero()[:, 0]
+    visible = (points[:, 2] >= camera.near) & drawable(quats, opacities)
+    rows = visible.nonzero()[:, 0]
     rows = rows[points[rows, 2].argsort(stable=True)]
     centres, projected = project(points[rows], quats[rows], scales[rows], viewmat, K, camera)
     covariance, opacities = blurred(projected, opacities[rows], screen_filter)
     colors = shade(means[rows], sh0[rows], shN[rows], camera.position.to(means))
     x = torch.arange(camera.width).to(means) + 0.5
     y = torch.arange(camera.height).to(means) + 0.5
-    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 1, 2)
+    grid = torch.meshgrid(x, y, indexing="xy")
+    pixels = torch.stack(grid, -1).reshape(-1, 1, 2)
     offsets = pixels - centres
     power = -0.5 * torch.einsum("pni,nij,pnj->pn", offsets, torch.linalg.inv(covariance), offsets)
     alphas = (opacities * power.exp()).clamp(max=ALPHA_MAX)
     weights, transmittance = blend(torch.where(alphas >= ALPHA_MIN, alphas, 0))
     image = weights @ colors + transmittance[:, None] * background
-    return image.reshape(camera.height, camera.width, 3), (1 - transmittance).reshape(
-        camera.height, camera.width
-    )
+    size = camera.height, camera.width
+    return image.reshape(*size, 3), (1 - transmittance).reshape(size)
 
 
 def project(
@@ -60,9 +61,10 @@ def project(
     margin = 0.15 * size / focal
     low = -K[:2, 2] / focal - margin
     high = (size - K[:2, 2]) / focal + margin
-    ray = torch.minimum(torch.maximum(points[:, :2] / depth[:, None], low), high)
+    ray = torch.maximum(points[:, :2] / depth[:, None], low).minimum(high)
     jacobian = torch.zeros(len(points), 2, 3).to(points)
-    jacobian[:, 0, 0], jacobian[:, 1, 1] = focal[0] / depth, focal[1] / depth
+    jacobian[:, 0, 0] = focal[0] / depth
+    jacobian[:, 1, 1] = focal[1] / depth
     jacobian[:, :, 2] = -focal * ray / depth[:, None]
     half = jacobian @ viewmat[:3, :3] @ rotations(quats) * scales[:, None, :]
     centres = focal * points[:, :2] / depth[:, None] + K[:2, 2]
@@ -71,7 +73,8 @@ def project(
 
 def rotations(quats: Tensor) -> Tensor:
     """``[n, 3, 3]`` of quaternions wxyz of any length above 0."""
-    w, *axis = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    unit_quats = quats / quats.norm(dim=1, keepdim=True)
+    w, *axis = unit_quats.unbind(1)
     x, y, z = axis
     return torch.stack(
         [
@@ -117,9 +120,11 @@ def blend(alphas: Tensor) -> tuple[Tensor, Tensor]:
 
 def shade(means: Tensor, sh0: Tensor, shN: Tensor, eye: Tensor) -> Tensor:
     """Colours ``max(0, 0.5 + SH(direction))``, ``[n, 3]``."""
-    directions = means - eye
-    basis = sh_basis(directions / directions.norm(dim=1, keepdim=True))[:, : shN.shape[1] + 1]
-    return (0.5 + (basis[:, :, None] * torch.cat([sh0, shN], 1)).sum(1)).clamp(min=0)
+    offsets = means - eye
+    directions = offsets / offsets.norm(dim=1, keepdim=True)
+    coefficients = torch.cat([sh0, shN], 1)
+    basis = sh_basis(directions)[:, : coefficients.shape[1], None]
+    return (0.5 + (basis * coefficients).sum(1)).clamp(min=0)
 
 
 def sh_basis(directions: Tensor) -> Tensor:

@@ -24,9 +24,11 @@ class GradientSum:
     views: int = 1
 
     def __add__(self, other: GradientSum) -> GradientSum:
-        gradients = {name: mine + other.gradients[name] for name, mine in self.gradients.items()}
         return GradientSum(
-            gradients, self.kept | other.kept, self.loss + other.loss, self.views + other.views
+            {name: mine + other.gradients[name] for name, mine in self.gradients.items()},
+            self.kept | other.kept,
+            self.loss + other.loss,
+            self.views + other.views,
         )
 
 
@@ -70,7 +72,7 @@ class RowAdam:
         count = np.arange(1, last + 2)
         with np.errstate(under="ignore"):
             corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
-        table = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
+        table = np.pad(corrections, ((0, 0), (1, 0))).astype(np.float32)
         self._corrections = torch.from_numpy(table).to(device)
 
     @torch.no_grad()
@@ -97,7 +99,7 @@ class RowAdam:
                 *(moments[name] for moments in self.moments.values()),
                 gradients[name].contiguous(),
             )
-            flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
+            flat = [_as_matrix(tensor).numpy() for tensor in tensors]
             counted = 0 if jobs else 1
             row_arrays = (
                 rows.numpy(),
@@ -121,23 +123,24 @@ class RowAdam:
         answer first).
         """
         self.steps.add_(rows)
-        length, correction = self._corrections[
-            :, self.steps.clamp(max=self._corrections.shape[1] - 1)
-        ].unsqueeze(2)
+        counts = self.steps.clamp(max=self._corrections.shape[1] - 1)
+        length, correction = self._corrections[:, counts].unsqueeze(2)
         for name, parameter in self.parameters.items():
-            values = (parameter, *(each[name] for each in self.moments.values()))
-            flat_parameter, first, second = (
-                each.view(len(each), math.prod(each.shape[1:])) for each in values
-            )
+            flat_parameter = _as_matrix(parameter)
+            first, second = (_as_matrix(moments[name]) for moments in self.moments.values())
             gradient = gradients[name].reshape(flat_parameter.shape)
             lengths = length * self._units[name][:, None]
             m = self.beta1 * first + (1 - self.beta1) * gradient
             v = self.beta2 * second + (1 - self.beta2) * gradient * gradient
-            moved = flat_parameter - rates[name] * lengths * m / (
-                v.sqrt() * correction + self.epsilon
-            )
+            root = v.sqrt() * correction + self.epsilon
+            moved = flat_parameter - rates[name] * lengths * m / root
             for old, new in ((first, m), (second, v), (flat_parameter, moved)):
                 old.copy_(torch.where(rows[:, None], new, old))
+
+
+def _as_matrix(tensor: Tensor) -> Tensor:
+    """``[N, columns]``, a view of a tensor ``[N, ...]``, with no column where it has no values."""
+    return tensor.view(len(tensor), math.prod(tensor.shape[1:]))
 
 
 def learning_rates(config: AdaptConfig, decay: str) -> dict[str, float]:

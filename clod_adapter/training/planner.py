@@ -95,10 +95,9 @@ def _sh_degree(
     degree = highest
     decisions = list[Decision]()
     for band, loss in sh_degree_losses(base, views, LIMIT):
-        degrees, pronoun = (
-            (f"{band}", "it") if band == highest else (f"{band} to {highest}", "them")
-        )
-        why = f"change without {pronoun}, {_counted(len(views))}"
+        several = band < highest
+        degrees = f"{band} to {highest}" if several else f"{band}"
+        why = f"change without {'them' if several else 'it'}, {_counted(len(views))}"
         if loss < LIMIT:  # one decision for all that are left out
             degree = band - 1
             decisions = []
@@ -158,9 +157,8 @@ def sh_degree_losses(
 
     expected = quality(highest) if highest else []
     for degree in range(highest, 0, -1):
-        change = fmean(
-            abs(psnr_change(a, b)) for a, b in zip(expected, quality(degree - 1), strict=True)
-        )
+        pairs = zip(expected, quality(degree - 1), strict=True)
+        change = fmean(abs(psnr_change(a, b)) for a, b in pairs)
         yield degree, change
         if not change < limit:
             return
