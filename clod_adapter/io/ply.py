@@ -204,14 +204,14 @@ def _check_length(path: Path, head: Head, length: int) -> None:
     text = head.ply.text
     least = head.size - text
     for element, count in head.elements:
-        kinds = [
-            p.len_dtype if isinstance(p, PlyListProperty) else p.val_dtype
-            for p in element.properties
-        ]
-        # Of text a digit, and a space or line end, which the last line may lack.
-        least += count * (
-            max(1, 2 * len(kinds)) if text else sum(np.dtype(kind).itemsize for kind in kinds)
-        )
+        columns = element.properties
+        if text:  # a digit, and a space or line end, which the last line may lack
+            least += count * max(1, 2 * len(columns))
+            continue
+        for column in columns:
+            is_list = isinstance(column, PlyListProperty)
+            kind = column.len_dtype if is_list else column.val_dtype
+            least += count * np.dtype(kind).itemsize
     if least > length:
         rows = ", ".join(f"{count} of {element.name}" for element, count in head.elements)
         raise ClodError(
@@ -252,7 +252,8 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
         )
     if is_coloured(types) and all(types[name] == "u1" for name in RGB):
         types |= dict.fromkeys(column_map(0)["sh0"], "f4")
-    degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
+    higher = [name for name in types if re.fullmatch(r"f_rest_\d+", name)]
+    degree = degree_of(path, len(higher))
     for name in chain(*column_map(degree).values()):
         if types.get(name) not in ("f4", "f8"):
             fault = "is not float or double" if name in types else "is missing"

@@ -79,11 +79,9 @@ def is_coloured(names: Container[str]) -> bool:
     """Whether RGB stands for the harmonics, as ``ns-export gaussian-splat --ply-color-mode rgb``
     writes it.
     """
-    return (
-        all(name in names for name in (*RGB, "scale_0"))
-        and "f_dc_0" not in names
-        and "f_rest_0" not in names
-    )
+    if "f_dc_0" in names or "f_rest_0" in names:
+        return False
+    return all(name in names for name in (*RGB, "scale_0"))
 
 
 def with_harmonics(rows: np.ndarray) -> np.ndarray:
@@ -230,10 +228,8 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
 
     arrays_of(path, gaussians)  # rejects rows that load would drop
     opaque = gaussians.opacity_logits.isposinf()
-    gaussians = gaussians.replace(
-        opacity_logits=gaussians.opacity_logits.masked_fill(opaque, OPAQUE)
-    )
-    write_rows(path, gaussians, metadata)
+    logits = gaussians.opacity_logits.masked_fill(opaque, OPAQUE)
+    write_rows(path, gaussians.replace(opacity_logits=logits), metadata)
     count = int(opaque.sum())
     note = f"{count} opacities of +inf are written as {OPAQUE:g}, which is 1 too"
     return (note,) if count else ()
@@ -255,11 +251,10 @@ def write_rows(
     constants = constants_of(metadata, growth=gaussians.growth_d is not None)
     dial = dial_columns(tensors)
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
+    names = layout.names or ()
     # growth_d alone is foreign
-    dropped = {FILTER_3D, *((SIGMA, GROWTH, OPACITY) if dial else dial_columns(layout.names or ()))}
-    copied = [
-        name for name in layout.names or () if name not in dropped and not name.startswith(COLUMN)
-    ]
+    dropped = {FILTER_3D, *((SIGMA, GROWTH, OPACITY) if dial else dial_columns(names))}
+    copied = [name for name in names if name not in dropped and not name.startswith(COLUMN)]
     kinds = {name: layout[name] for name in copied}
     if any(origin):
         kinds |= dict.fromkeys("xyz", np.dtype("f8"))
@@ -280,7 +275,8 @@ def write_rows(
             for name, value in constants.items():
                 block[name] = value
             for attribute, group in (column_map(gaussians.sh_degree) | dial).items():
-                values = tensors[attribute][rows].float().cpu().numpy().reshape(len(block), -1)
+                values = tensors[attribute][rows].float().cpu().numpy()
+                values = values.reshape(len(block), -1)
                 for k, name in enumerate(group):
                     shift = origin[k] if attribute == "means" else 0.0
                     new = values[:, k]

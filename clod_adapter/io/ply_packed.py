@@ -43,9 +43,9 @@ def column_types(element: PlyElement) -> dict[str, str]:
 
 def is_packed(header: PlyData) -> bool:
     """Whether the vertices are packed."""
-    return "vertex" in header and any(
-        p.name.startswith("packed_") for p in header["vertex"].properties
-    )
+    if "vertex" not in header:
+        return False
+    return any(column.name.startswith("packed_") for column in header["vertex"].properties)
 
 
 def check_packed(path: Path, header: PlyData) -> int:
@@ -94,12 +94,14 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
         log_scales = vectors("scale_", packed["packed_scale"])
         *colours, opacity = _shares(packed["packed_color"], (8, 8, 8, 8))
         if _COLOURS.issubset(chunks.dtype.names or ()):
-            colours = [
-                within(channel, share) for channel, share in zip("rgb", colours, strict=True)
-            ]
+            shares = zip("rgb", colours, strict=True)
+            colours = [within(channel, share) for channel, share in shares]
     opacity = np.clip(opacity, 0.25 / 255, 254.75 / 255)  # so that no logit is infinite
     levels = np.arange(256, dtype=np.float32)
-    steps = (np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256)) - 0.5) * 8
+    shares_of_levels = (levels + 0.5) / 256
+    shares_of_levels[0] = 0
+    shares_of_levels[255] = 1
+    steps = (shares_of_levels - 0.5) * 8
     harmonics = np.empty((count, bands, 3), np.float32)
     if table is not None:
         for k in range(3 * bands):  # channel by channel
@@ -140,19 +142,21 @@ def _shares(bits: np.ndarray, widths: tuple[int, ...]) -> list[np.ndarray]:
     for width in widths:
         shift -= width
         largest = np.uint32((1 << width) - 1)
-        shares.append(((bits >> np.uint32(shift)) & largest).astype(np.float32) / largest)
+        level = (bits >> np.uint32(shift)) & largest
+        shares.append(level.astype(np.float32) / largest)
     return shares
 
 
 def _rotations(bits: np.ndarray) -> np.ndarray:
     """``[N, 4]`` float32 unit quaternions, wxyz."""
-    small = (np.stack(_shares(bits << np.uint32(2), (10, 10, 10))) - 0.5) * np.float32(np.sqrt(2))
+    shares = np.stack(_shares(bits << np.uint32(2), (10, 10, 10)))
+    small = (shares - 0.5) * np.float32(np.sqrt(2))
     largest = np.sqrt(np.maximum(0, 1 - (small**2).sum(0)))
     missing = bits >> np.uint32(30)
     quats = np.empty((len(bits), 4), np.float32)
     for component in range(4):
-        stored = np.where(
-            missing > component, small[min(component, 2)], small[max(component - 1, 0)]
-        )
+        before = small[min(component, 2)]
+        after = small[max(component - 1, 0)]
+        stored = np.where(missing > component, before, after)
         quats[:, component] = np.where(missing == component, largest, stored)
     return quats

@@ -214,7 +214,8 @@ def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarra
         wider = 0.5 * np.logaddexp(2 * scales, 2 * size)
         log_opacity = -np.logaddexp(0, -logits) + (scales - wider).sum(1, keepdims=True)
         # log(1 - a), of a near 1 from the logit itself where there is no filter
-        fused = np.where(log_opacity < 0, log_opacity - np.log(-np.expm1(log_opacity)), np.inf)
+        fused = log_opacity - np.log(-np.expm1(log_opacity))
+        fused = np.where(log_opacity < 0, fused, np.inf)
         unfiltered = (wider == scales).all(1, keepdims=True)
         opacity = np.where(unfiltered, logits, fused)[:, 0]
         return wider.astype(np.float32), opacity.astype(np.float32)
@@ -303,8 +304,9 @@ def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarr
     harmonics = []
     for degree in range(1, 5):
         for m in range(-degree, degree + 1):
-            sign = x ** ((abs(m) - (m < 0)) % 2) * y ** int(m < 0) * z ** ((degree - m) % 2)
-            harmonics.append(sign)
+            odd_in_x = (abs(m) - (m < 0)) % 2
+            odd_in_z = (degree - m) % 2
+            harmonics.append(x**odd_in_x * y ** int(m < 0) * z**odd_in_z)
     bands = arrays["shN"].shape[1]
     return {
         **arrays,
@@ -317,7 +319,8 @@ def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarr
 def normalized(quats: np.ndarray) -> np.ndarray:
     """``[N, 4]`` float32 quaternions of unit length; none is zero."""
     wide = quats.astype(np.float64)
-    return (wide / np.linalg.norm(wide, axis=1, keepdims=True)).astype(np.float32)
+    lengths = np.linalg.norm(wide, axis=1, keepdims=True)
+    return (wide / lengths).astype(np.float32)
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:

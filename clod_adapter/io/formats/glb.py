@@ -275,20 +275,20 @@ def _values(
     path: Path, gltf: dict[str, Any], binary: memoryview, number: int, width: int
 ) -> np.ndarray:
     """``[N, width]`` float32, the values of an accessor; ``[N]`` where the width is 1."""
-    accessor = gltf["accessors"][_whole(number)]
+    accessor = gltf["accessors"][_count(number)]
     if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
         raise ClodError(
             f"{path}: an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}"
         )
     kind = np.dtype(_KINDS[accessor["componentType"]])
-    view = gltf["bufferViews"][_whole(accessor["bufferView"])]
-    if _whole(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
+    view = gltf["bufferViews"][_count(accessor["bufferView"])]
+    if _count(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
         raise ClodError(f"{path}: its data are compressed, or in another file; {_REMEDY}")
     size = kind.itemsize * width
-    stride = _whole(view.get("byteStride", size))
-    start = _whole(accessor.get("byteOffset", 0))
-    count = _whole(accessor["count"])
-    data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
+    stride = _count(view.get("byteStride", size))
+    start = _count(accessor.get("byteOffset", 0))
+    count = _count(accessor["count"])
+    data = binary[_count(view.get("byteOffset", 0)) :][: _count(view["byteLength"])]
     if not count or stride < size or start + (count - 1) * stride + size > len(data):
         raise ClodError(
             f"{path}: an attribute has no values, or more than the file; copy or export it again"
@@ -300,7 +300,7 @@ def _values(
     return numbers[:, 0] if width == 1 else numbers
 
 
-def _whole(value: Any) -> int:
+def _count(value: Any) -> int:
     if not isinstance(value, int) or value < 0:
         raise ValueError(f"{value!r:.20} is no count")
     return value
@@ -313,8 +313,9 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, O
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
     parents: dict[int, int] = {}
     for number, node in enumerate(nodes):
-        parents |= dict.fromkeys(map(_whole, node.get("children", [])), number)
-    above = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), None)
+        parents |= dict.fromkeys(map(_count, node.get("children", [])), number)
+    owners = (number for number, node in enumerate(nodes) if node.get("mesh") == mesh)
+    above = next(owners, None)
     placed = np.eye(4)
     for _ in nodes:  # at most as many are above each other
         if above is not None:
@@ -332,8 +333,9 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, O
             " and export it again"
         )
     x, y, z = map(float, placed[:3, 3])
-    # a rounded scale of 1 changes no value
-    return (1.0 if abs(scale - 1) < 1e-6 else scale), bool(turned), (0.0 - x, 0.0 - y, z)
+    if abs(scale - 1) < 1e-6:
+        scale = 1.0  # a rounded one, which changes no value
+    return scale, bool(turned), (0.0 - x, 0.0 - y, z)
 
 
 def _matrix(path: Path, node: dict[str, Any]) -> np.ndarray:

@@ -24,12 +24,12 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     arrays = values.arrays_of(path, gaussians)
     opacities = values.sigmoid(arrays["opacity_logits"])
     # As logarithms, in which no volume is too small.
+    log_volumes = arrays["log_scales"].astype(np.float64).sum(1)
     with np.errstate(divide="ignore"):
-        order = np.argsort(
-            -(arrays["log_scales"].astype(np.float64).sum(1) + np.log(opacities)), kind="stable"
-        )
+        order = np.argsort(-(log_volumes + np.log(opacities)), kind="stable")
     rows = np.empty(len(gaussians), _ROW)
-    rows["means"], rows["scales"] = arrays["means"], values.scales_of(path, arrays["log_scales"])
+    rows["means"] = arrays["means"]
+    rows["scales"] = values.scales_of(path, arrays["log_scales"])
     rows["rgba"] = values.colours_of(arrays["sh0"], opacities)
     rows["quats"] = values.bytes_of(128 * values.normalized(arrays["quats"]) + 128)
     path.write_bytes(rows[order].tobytes())

@@ -106,12 +106,11 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         columns = list(dial_columns(arrays))
         column_names = {COLUMNS: columns} if len(columns) > 1 else {}  # sigma_d alone needs no name
         text = document(MODEL, metadata, **column_names).encode()
-        halves = b"".join(
-            np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns
-        )
-        sections.append(
-            struct.pack("<III", RECORD, 4 + len(text) + len(halves), len(text)) + text + halves
-        )
+        halves = b""
+        for name in columns:
+            halves += np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes()
+        size = 4 + len(text) + len(halves)
+        sections += [struct.pack("<III", RECORD, size, len(text)), text, halves]
     gzip = zlib.compressobj(wbits=31)
     path.write_bytes(gzip.compress(b"".join(sections)) + gzip.flush())
     return (*moved, *_losses(arrays, bits))
@@ -129,7 +128,8 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
     reach = np.abs(arrays["means"]).max(1).astype(np.float64)
     most = min(float(reach.max()), 8 * float(np.quantile(reach, 0.99)))
     bits = min(20, 23 - math.frexp(most)[1])
-    factor = np.minimum(1, 2.0 ** (23 - bits) / np.maximum(reach, 1e-300))[:, None]
+    end = 2.0 ** (23 - bits)
+    factor = np.minimum(1, end / np.maximum(reach, 1e-300))[:, None]
     moved = int((factor < 1).sum())
     if not moved:
         return arrays, bits, ()
@@ -142,7 +142,6 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
         nearer[SIGMA] = arrays[SIGMA] * factor[:, 0]
     if GROWTH in arrays:
         nearer["log_scales"] -= arrays[GROWTH][:, None] * np.log(factor)
-    end = 2.0 ** (23 - bits)
     note = f"the {moved} farthest are moved to {end:g} from 0, and made as much smaller"
     return nearer, bits, (note,)
 
@@ -174,8 +173,10 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     xyzw *= np.where(xyzw[rows, largest] < 0, -1.0, 1.0)[:, None]
     packed = largest.astype(np.uint32)
     for axis in range(4):
-        level = np.floor(MAGNITUDE * np.abs(xyzw[:, axis]) + 0.5).clip(max=511).astype(np.uint32)
-        longer = (packed << 10) | (np.uint32(512) * (xyzw[:, axis] < 0)) | level
+        component = xyzw[:, axis]
+        level = np.floor(MAGNITUDE * np.abs(component) + 0.5).clip(max=511).astype(np.uint32)
+        sign = np.uint32(512) * (component < 0)
+        longer = (packed << 10) | sign | level
         packed = np.where(largest == axis, packed, longer)
     return packed.astype("<u4")
 
@@ -197,10 +198,9 @@ def _losses(arrays: dict[str, np.ndarray], bits: int) -> list[str]:
 
 def has_dial(path: Path) -> bool:
     """Whether the file has a sigma_d; all of it is read, which is never much."""
-    return (
-        not read_bytes(path, START).startswith(NEW_SPZ)
-        and SIGMA in read(path, read_bytes(path)).arrays
-    )
+    if read_bytes(path, START).startswith(NEW_SPZ):
+        return False
+    return SIGMA in read(path, read_bytes(path)).arrays
 
 
 def read(path: Path, data: bytes) -> Source:
@@ -210,25 +210,20 @@ def read(path: Path, data: bytes) -> Source:
     data = _unpacked(path, data)
     magic, version, count = struct.unpack_from("<III", data)
     degree, bits, flags = data[12:15]
-    if (
-        magic != MAGIC
-        or version not in (2, 3)
-        or degree not in SH_COUNTS
-        or bits > 24
-        or count > MOST
-    ):
+    readable = magic == MAGIC and version in (2, 3)
+    if not readable or degree not in SH_COUNTS or bits > 24 or count > MOST:
         raise ClodError(
             f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians);"
             f" {_CONVERT}"
         )
-    sizes = 9, 1, 3, 3, 4 if version == 3 else 3, 3 * (SH_COUNTS[degree] - 1)
+    bands = SH_COUNTS[degree] - 1
+    sizes = 9, 1, 3, 3, 4 if version == 3 else 3, 3 * bands
     end = HEADER.size + count * sum(sizes)
     if not count or end > len(data):
         raise ClodError(f"{path}: has no Gaussians or is truncated; copy or export it again")
     table = np.frombuffer(data[HEADER.size : end], np.uint8)
-    columns = [
-        column.reshape(count, -1) for column in np.split(table, count * np.cumsum(sizes)[:-1])
-    ]
+    ends = count * np.cumsum(sizes)[:-1]
+    columns = [column.reshape(count, -1) for column in np.split(table, ends)]
     records = _records(data[end:]) if flags & EXTENDED else {}
     stored, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
     metadata = parse_metadata(path, stored, dial=bool(dial))
@@ -315,7 +310,8 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
     """``[N, 4]`` wxyz; the inverse of ``_packed_quats``."""
     if quats.shape[1] == 3:  # version 2: w is not stored, and at least 0
         xyz = quats / 127.5 - 1
-        return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
+        w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True)))
+        return np.concatenate([w, xyz], 1)
     packed = np.ascontiguousarray(quats).view("<u4")[:, 0]
     largest = packed >> 30
     xyzw = np.zeros((len(packed), 4), np.float64)
@@ -324,5 +320,6 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
         value = (packed & 511) / MAGNITUDE
         xyzw[:, axis] = np.where(stored, np.where(packed & 512, -value, value), 0)
         packed = np.where(stored, packed >> 10, packed)
-    xyzw[np.arange(len(xyzw)), largest] = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(1)))
+    squares = (xyzw**2).sum(1)
+    xyzw[np.arange(len(xyzw)), largest] = np.sqrt(np.maximum(0, 1 - squares))
     return np.roll(xyzw, 1, axis=1).astype(np.float32)

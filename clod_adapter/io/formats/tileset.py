@@ -80,12 +80,12 @@ def write_tileset(
         chains += chain
     root = tile(coarsest, scene, "root.glb", chains) | {"refine": "REPLACE"}
     extensions = {"extensionsUsed": [EXTENSION, SPZ], "extensionsRequired": [EXTENSION, SPZ]}
+    half_diagonal = float(np.linalg.norm(root["boundingVolume"]["box"][3:]))
     index = {
         "asset": {"version": "1.1", "generator": f"clod-adapter {package_version()}"},
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {"3DTILES_content_gltf": extensions},
-        "geometricError": errors[coarsest]
-        + ALLOWED * 2 * float(np.linalg.norm(root["boundingVolume"]["box"][3:])),
+        "geometricError": errors[coarsest] + ALLOWED * 2 * half_diagonal,
         "root": root,
     }
     (folder / TILESET).write_text(json.dumps(index, indent=1), encoding="utf-8")
@@ -143,7 +143,8 @@ def _box(centres: Sequence[np.ndarray], rows: Rows, origin: Origin) -> list[floa
     viewer inside.
     """
     points = np.concatenate([centre[level] for centre, level in zip(centres, rows, strict=True)])
-    ends = np.quantile(points, [STRAY / 2, 1 - STRAY / 2], 0) + np.array(origin)
+    shares = [STRAY / 2, 1 - STRAY / 2]
+    ends = np.quantile(points, shares, 0) + np.array(origin)
     turned = -ends[::-1, [0, 2, 1]]
     centre = turned.mean(0)
     half = (turned[1] - turned[0]) / 2

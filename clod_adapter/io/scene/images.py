@@ -86,7 +86,8 @@ def read_image(
                 f"{path}: is {shape[0]}x{shape[1]}, its camera {width}x{height}, another shape;"
                 " give the images the model was made from"
             )
-        factor = max(1, shape[0] // (2 * max_width)) if size[0] * size[1] > LARGE else 1
+        large = size[0] * size[1] > LARGE
+        factor = max(1, shape[0] // (2 * max_width)) if large else 1
         if factor > 1:
             source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
             factor = max(1, factor * source.width // size[0])
@@ -158,7 +159,8 @@ def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Imag
     if deep:
         # grey; 16-bit colour Pillow has brought to 8 bits itself
         values = np.asarray(source).astype(np.uint32)
-        return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
+        bytes_of_grey = ((values + 128) // 257).astype(np.uint8)
+        return Image.fromarray(bytes_of_grey).convert("RGB")
     if "A" not in source.getbands() and "transparency" not in source.info:
         if source.mode != "RGB":
             return source.convert("RGB")
@@ -168,7 +170,8 @@ def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Imag
     if rgba.getchannel("A").getextrema() == (255, 255):
         return rgba.convert("RGB")
     notes.append(("have transparency: laid over black", ""))
-    return Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba).convert("RGB")
+    black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
+    return Image.alpha_composite(black, rgba).convert("RGB")
 
 
 def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None) -> Photograph:
@@ -178,7 +181,7 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
     There it is a PNG named by a hash of what it was made from, which a later run reads.
     """
     if cache is None or image.is_pinhole:
-        return _made(image, path, max_width)
+        return _made_pinhole(image, path, max_width)
     state = path.stat()
     camera = image.camera
     ingredients = (
@@ -193,7 +196,8 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
         pycolmap.__version__,
         PIL.__version__,
     )
-    file = cache / f"{hashlib.sha256(repr(ingredients).encode()).hexdigest()[:32]}.png"
+    digest = hashlib.sha256(repr(ingredients).encode()).hexdigest()
+    file = cache / f"{digest[:32]}.png"
     pixels: Image.Image | None = None
     # Absent, or damaged: Pillow raises many kinds.
     with suppress(Exception), Image.open(file, formats=["PNG"]) as source:
@@ -202,7 +206,7 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
         notes = [(change, detail) for change, detail in about["notes"]]
         pixels = source.convert("RGB")
     if pixels is None:
-        pixels, K, notes = _made(image, path, max_width)
+        pixels, K, notes = _made_pinhole(image, path, max_width)
         about = PngImagePlugin.PngInfo()
         about.add_text(_KEY, json.dumps({"K": K.tolist(), "notes": notes}))
         with atomic_path(file) as temporary:
@@ -212,7 +216,7 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
     return pixels, K, notes
 
 
-def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
+def _made_pinhole(image: PosedImage, path: Path, max_width: int) -> Photograph:
     width, height = image_size(path)
     large = width * height > LARGE
     with _ONE_LARGE if large else nullcontext():
