@@ -153,18 +153,13 @@ class Adapter:
                 update = torch.where(update == 0, old, old + update.float())
             changes[name] = update
         plain = base.replace(sigma_d=None, growth_d=None, attenuation=None)
+        settings: Any = {"attenuation": self.attenuation, "screen_filter": self.screen_filter}
         columns = {name: x.to(base.means.device) for name, x in dial_tensors(self).items()}
         if self.added:
             far: Any = {name: x.to(base.means.device) for name, x in self.added.items()}
             far |= {name: column[len(base) :] for name, column in columns.items()}
-            return with_near(
-                plain,
-                Gaussians(**far, attenuation=self.attenuation, screen_filter=self.screen_filter),
-            )
-        changes |= columns
-        return plain.replace(
-            **changes, attenuation=self.attenuation, screen_filter=self.screen_filter
-        )
+            return with_near(plain, Gaussians(**far, **settings))
+        return plain.replace(**changes, **columns, **settings)
 
 
 def dial_tensors(owner: Adapter | Gaussians) -> dict[str, Tensor]:

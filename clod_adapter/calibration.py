@@ -66,9 +66,8 @@ class Viewpoint:
         near = all(abs(value) < FARTHEST for value in values[:3])
         require(near, "the centre of a viewpoint", values[:3], f"below {FARTHEST:g}")
         lengths = math.hypot(*values[4:7]), math.hypot(*values[7:10])
-        has_direction = (
-            NARROWEST < self.fov < math.pi and max(abs(length - 1) for length in lengths) < 1e-3
-        )
+        units = max(abs(length - 1) for length in lengths) < 1e-3
+        has_direction = units and NARROWEST < self.fov < math.pi
         require(
             has_direction or not any(values[4:]),
             "the direction of a viewpoint",
@@ -156,12 +155,10 @@ class Calibration:
 
         Rows may be in any order, and the machine's name any text; the other fields are passed on.
         """
-        by_dial = {
-            float(r.virtual_scale): CalibrationRow(
-                *map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms))
-            )
-            for r in sorted(rows, key=lambda r: r.virtual_scale)
-        }
+        by_dial = {}
+        for row in sorted(rows, key=lambda row: row.virtual_scale):
+            values = row.virtual_scale, row.kept, row.psnr, row.ssim, row.frame_ms
+            by_dial[float(row.virtual_scale)] = CalibrationRow(*map(float, values))
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
         return cls(tuple(by_dial.values()), width=size[0], height=size[1], machine=name, **others)
 

@@ -126,10 +126,10 @@ def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]])
     """Rejects what is no pinhole camera."""
     (fx, skew, _), (other_skew, fy, _), last = K
     axes = [row[:3] for row in viewmat[:3]]
-    bent = max(
-        abs(sum(map(mul, axes[i], axes[j])) - (i == j)) for i, j in product(range(3), repeat=2)
-    )
-    moves = bent < BENT and viewmat[3] == [0, 0, 0, 1]
+    bent = []
+    for i, j in product(range(3), repeat=2):
+        bent.append(abs(sum(map(mul, axes[i], axes[j])) - (i == j)))
+    moves = max(bent) < BENT and viewmat[3] == [0, 0, 0, 1]
     for ok, defect in (
         (all(map(math.isfinite, chain(*viewmat, *K))), "a value that is not finite"),
         (moves, "a viewmat that is no rotation and translation"),
@@ -177,7 +177,8 @@ class View:
         def image() -> Tensor:
             pixels = self.image[: 2 * camera.height, : 2 * camera.width]
             pairs = pixels[::2].short() + pixels[1::2]
-            return ((pairs[:, ::2] + pairs[:, 1::2] + 2) >> 2).to(torch.uint8)
+            squares = pairs[:, ::2] + pairs[:, 1::2]
+            return ((squares + 2) >> 2).to(torch.uint8)
 
         return StoredView(camera, image)
 
@@ -264,11 +265,9 @@ def with_near_planes(cameras: Sequence[Camera]) -> list[Camera]:
     theirs.
     """
     extent = camera_extent(cameras) if cameras else 0.0
-    return (
-        [replace(camera, near=near_plane(extent)) for camera in cameras]
-        if extent
-        else list(cameras)
-    )
+    if not extent:
+        return list(cameras)
+    return [replace(camera, near=near_plane(extent)) for camera in cameras]
 
 
 def in_its_unit(scene: Scene) -> Scene:
@@ -276,9 +275,12 @@ def in_its_unit(scene: Scene) -> Scene:
     views = (*scene.train, *scene.test)
     cameras = with_near_planes([view.camera for view in views])
     moved = tuple(view.at(camera) for view, camera in zip(views, cameras, strict=True))
-    return replace(scene, train=moved[: len(scene.train)], test=moved[len(scene.train) :])
+    count = len(scene.train)
+    return replace(scene, train=moved[:count], test=moved[count:])
 
 
 def spread(views: Sequence[T], most: int) -> Sequence[T]:
     """Evenly spread views, at most ``most``."""
-    return [views[k * len(views) // most] for k in range(most)] if len(views) > most else views
+    if len(views) <= most:
+        return views
+    return [views[k * len(views) // most] for k in range(most)]

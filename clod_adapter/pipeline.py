@@ -127,9 +127,8 @@ def adapt_checkpoint(
     result = replace(result, base_rows=base_rows, alignment=alignment)
     if scene.test and not adapted.interrupted:
         try:
-            result = calibrated(
-                _measured(result, config.max_sv, progress, notes.append), notes.append
-            )
+            measured = _measured(result, config.max_sv, progress, notes.append)
+            result = calibrated(measured, notes.append)
         except Stopped as stopped:
             notes.append(f"the result is not measured: {stopped}")
     return replace(result, notes=tuple(dict.fromkeys(notes)))

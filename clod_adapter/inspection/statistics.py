@@ -103,21 +103,15 @@ def values_of(prepared: Prepared) -> dict[str, Any]:
     distance = np.linalg.norm(means.astype(np.float64) - middle, axis=0)
     diagonal = float(np.linalg.norm([spread.high - spread.low for spread in position]))
     same = means[:, np.lexsort(means)]
-    nonzero_coefficients = [
-        k + 1
-        for k in range(prepared.arrays["shN"].shape[1])
-        if prepared.arrays["shN"][:, k][keep].any()
-    ]
+    harmonics = prepared.arrays["shN"]
+    nonzero = [k + 1 for k in range(harmonics.shape[1]) if harmonics[:, k][keep].any()]
+    highest = max(nonzero, default=0)
     return dict(
         total=len(keep),
         count=int(keep.sum()),
         dropped=prepared.dropped,
         position=tuple(map(Spread.moved, position, prepared.origin)),
-        used_sh_degree=next(
-            degree
-            for degree, count in SH_COUNTS.items()
-            if count > max(nonzero_coefficients, default=0)
-        ),
+        used_sh_degree=next(degree for degree, count in SH_COUNTS.items() if count > highest),
         scale=Spread.of(scales.ravel()),
         opacity=Spread.of(opacities),
         needles=float((scales[2] > NEEDLE * scales[1]).mean()),

@@ -172,26 +172,22 @@ def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
     """Draws error against one of QUANTITIES: lines for files with a dial, points for others."""
     key, unit, label = QUANTITIES[quantity]
     notes = list[tuple[str, tuple[float, float]]]()
-    for k, one in enumerate(series):
-        rows = [row for row in one.rows if row[key] > 0]  # a log axis has no 0
+    for k, line in enumerate(series):
+        rows = [row for row in line.rows if row[key] > 0]  # a log axis has no 0
         if not rows:
             continue
         points = [(row[key] / unit, row["psnr"]) for row in rows]
-        _line(axes, k, one.label, points, linestyle="-" if one.dial else "none")
-        if one.dial:
-            notes += [
-                (f"s = {row['virtual_scale']:g}", at) for row, at in zip(rows, points, strict=True)
-            ]
+        _line(axes, k, line.label, points, linestyle="-" if line.dial else "none")
+        if line.dial:
+            texts = [f"s = {row['virtual_scale']:g}" for row in rows]
+            notes += zip(texts, points, strict=True)
     _finish(axes, label)
     # Labels of points, without those that would cover another; the first and the last come first.
     point = axes.figure.dpi / 72
     placed = list[Any]()
     for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
         x, y = axes.transData.transform(at) / point
-        if all(
-            abs(x - label_place[0]) > ROOM[0] or abs(y - label_place[1]) > ROOM[1]
-            for label_place in placed
-        ):
+        if all(abs(x - left) > ROOM[0] or abs(y - low) > ROOM[1] for left, low in placed):
             placed.append((x, y))
             axes.annotate(
                 text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET
@@ -203,12 +199,8 @@ def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: flo
     horizontal line.
     """
     for k, curve in enumerate(curves):
-        _line(
-            axes,
-            k,
-            curve["label"],
-            [(point["seconds"], point["psnr"]) for point in curve["points"]],
-        )
+        points = [(point["seconds"], point["psnr"]) for point in curve["points"]]
+        _line(axes, k, curve["label"], points)
     if base_psnr is not None:
         axes.axhline(base_psnr, color=INK, linestyle="--", linewidth=1.1, label=BASE)
     _finish(axes, "seconds of adapting (log scale)")
@@ -243,7 +235,8 @@ def _finish(axes: Any, label: str) -> None:
     axes.set_yticks(_round_errors(*axes.get_ylim()))
     axes.yaxis.set_major_formatter(lambda psnr, _: f"{1e3 * error(psnr):.3g}")
     near, far = axes.get_xlim()
-    label_log(axes.xaxis, "{:,g}", (1, 2, 5) if far / near > 20 else (1, 1.5, 2, 3, 4, 5, 7))
+    subs = (1, 2, 5) if far / near > 20 else (1, 1.5, 2, 3, 4, 5, 7)
+    label_log(axes.xaxis, "{:,g}", subs)
     # above the axes it covers nothing
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_columns(axes), borderaxespad=0)
     axes.annotate(
@@ -285,11 +278,9 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
 
 def save_figure(figure: Any, path: str | Path) -> None:
     # Text in a PNG by which a later run recognizes its own output.
-    about = (
-        {"Software": f"clod-adapter {package_version()}"}
-        if Path(path).suffix.lower() == ".png"
-        else None
-    )
+    about = None
+    if Path(path).suffix.lower() == ".png":
+        about = {"Software": f"clod-adapter {package_version()}"}
     with atomic_path(path) as temporary:
         figure.savefig(temporary, facecolor=PAPER, metadata=about)
 

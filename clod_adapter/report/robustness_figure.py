@@ -27,8 +27,9 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
         import matplotlib
 
         styles: Styles = {None: {"color": ORANGE, "linestyle": "--"}}
-        for k, each in enumerate(ranges, 1):
-            styles[each] = {"color": matplotlib.colormaps["Blues"](0.4 + 0.6 * k / len(ranges))}
+        for k, max_sv in enumerate(ranges, 1):
+            colour = matplotlib.colormaps["Blues"](0.4 + 0.6 * k / len(ranges))
+            styles[max_sv] = {"color": colour}
         figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
         grid = figure.subplots(len(names), 4, squeeze=False, width_ratios=[1.35, 1.35, 1, 1])
         for axes, name in zip(grid, names, strict=True):
@@ -40,9 +41,8 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
             axes[0].set_title(name, loc="left", fontsize=10, weight="bold")
             for panel, label in zip(axes[:2], PANELS, strict=False):
                 panel.set_ylabel(label)
-        for panel, label in zip(
-            grid[-1], ("Gaussians kept (log scale)",) * 2 + PANELS[2:], strict=True
-        ):
+        labels = ["Gaussians kept (log scale)"] * 2 + [*PANELS[2:]]
+        for panel, label in zip(grid[-1], labels, strict=True):
             panel.set_xlabel(label)
         lines = dict[str, Any]()
         for axes in grid[:, 0]:
@@ -66,16 +66,17 @@ def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, styles: St
         elif outside := [row for row in rows if row["virtual_scale"] >= last]:
             _plot(axes, outside, key, style | {"linestyle": ":", "mfc": "white", "label": BEYOND})
         # On top, as the end of the range is in both.
-        _plot(
-            axes, [row for row in rows if last is None or row["virtual_scale"] <= last], key, style
-        )
+        inside = [row for row in rows if last is None or row["virtual_scale"] <= last]
+        _plot(axes, inside, key, style)
     axes.margins(x=0.06, y=0.12)
     label_log(axes.xaxis)
 
 
 def _plot(axes: Any, rows: Sequence[Mapping[str, Any]], key: str, style: Mapping[str, Any]) -> None:
     points = sorted((row["kept"], row[key]) for row in rows)
-    axes.plot([x for x, _ in points], [y for _, y in points], linewidth=1.5, markersize=4, **style)
+    kept = [x for x, _ in points]
+    values = [y for _, y in points]
+    axes.plot(kept, values, linewidth=1.5, markersize=4, **style)
 
 
 def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, styles: Styles) -> None:

@@ -139,7 +139,9 @@ def _initialized(
     """
     start = for_training(form_of(config).begin(reduced, views, config, progress))
     fields: Any = {name: getattr(start, name) for name in (*start.tensors(), "attenuation")}
-    return start.replace(**(group.broadcast(fields) if group else fields)).to(reduced.means.device)
+    if group:
+        fields = group.broadcast(fields)
+    return start.replace(**fields).to(reduced.means.device)
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:

@@ -99,12 +99,12 @@ def render_pseudo_views(
     """
     teacher = gaussians.without_empty_bands()
     held_out = range(0, len(cameras), TEST_EVERY) if len(cameras) > 1 else range(0)
-    train = tuple(
-        view for k, view in enumerate(_views(teacher, cameras, backed=BACKED)) if k not in held_out
-    )
+    views = _views(teacher, cameras, backed=BACKED)
+    train = tuple(view for k, view in enumerate(views) if k not in held_out)
     test = list[View]()
     for k in held_out:
-        test.append(View(cameras[k], render(teacher, cameras[k]).pixels.cpu()))
+        pixels = render(teacher, cameras[k]).pixels.cpu()
+        test.append(View(cameras[k], pixels))
         tell(progress, Phase.PSEUDO_VIEWS, len(test), len(held_out))
     size = f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"
     note = (
@@ -189,14 +189,13 @@ def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
     """The views with their teachers on ``device``: equal ones once, as a checkpoint is large."""
     teachers = {id(view.teacher): view.teacher for view in views if isinstance(view, PseudoView)}
     on_device = {number: teacher.to(device) for number, teacher in teachers.items()}
-    return tuple(
-        (
-            PseudoView(view.camera, on_device[id(view.teacher)], view.reach, view.backed)
-            if isinstance(view, PseudoView)
-            else view
-        )
-        for view in views
-    )
+    moved = list[View]()
+    for view in views:
+        if isinstance(view, PseudoView):
+            teacher = on_device[id(view.teacher)]
+            view = PseudoView(view.camera, teacher, view.reach, view.backed)
+        moved.append(view)
+    return tuple(moved)
 
 
 def _field(camera: Camera) -> float:

@@ -93,7 +93,8 @@ class Payload:
     @property
     def size(self) -> int:
         """Bytes of the PLY."""
-        return len(self.header) + 4 * self.header.count(b"\nproperty ") * len(self.gaussians)
+        columns = self.header.count(b"\nproperty ")
+        return len(self.header) + 4 * columns * len(self.gaussians)
 
     def blocks(self) -> Iterator[bytes]:
         """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, the
@@ -102,17 +103,19 @@ class Payload:
         A logit above 20 is written as 20, the same opacity in float32.
         """
         g = self.gaussians
-        tensors = self.gaussians.tensors()
+        tensors = g.tensors()
         columns = [
             g.means,
             g.sh0,
             g.shN.transpose(1, 2),
             g.opacity_logits.clamp(max=OPAQUE)[:, None],
             g.log_scales,
+            g.quats,
         ]
-        columns += [g.quats, *(tensors[name][:, None] for name in dial_columns(tensors))]
+        columns += [tensors[name][:, None] for name in dial_columns(tensors)]
         yield self.header
-        for columns_of_block in zip(*(column.split(BLOCK_ROWS) for column in columns), strict=True):
+        blocks = [column.split(BLOCK_ROWS) for column in columns]
+        for columns_of_block in zip(*blocks, strict=True):
             rows = torch.cat([values.flatten(1) for values in columns_of_block], 1).detach()
             yield rows.float().cpu().numpy().astype("<f4", copy=False).tobytes()
 
@@ -124,12 +127,10 @@ class Payload:
         """
         rows = _along_curve(self.gaussians.means)
         try:
-            notes = write(
-                file,
-                self.gaussians.select(rows),
-                Metadata(calibration=self.calibration, origin=self.origin),
-            )
-            gaussians = load(file, origin=self.origin).gaussians.to(self.gaussians.means.device)
+            metadata = Metadata(calibration=self.calibration, origin=self.origin)
+            notes = write(file, self.gaussians.select(rows), metadata)
+            gaussians = load(file, origin=self.origin).gaussians
+            gaussians = gaussians.to(self.gaussians.means.device)
             return Path(file).read_bytes(), gaussians, notes
         finally:
             Path(file).unlink(missing_ok=True)
@@ -143,9 +144,9 @@ def _along_curve(means: Tensor) -> Tensor:
     low, high = np.quantile(points, (0.01, 0.99), axis=0)
     places = 1023 * (points - low) / np.maximum(high - low, 1e-300)
     cells = places.clip(0, 1023).astype(np.int64)
-    code = sum(
-        ((cells[:, k] >> bit) & 1) << (3 * bit + k) for bit, k in product(range(10), range(3))
-    )
+    code = np.zeros(len(cells), np.int64)
+    for bit, axis in product(range(10), range(3)):
+        code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     return torch.from_numpy(np.argsort(code, kind="stable")).to(means.device)
 
 
@@ -210,7 +211,8 @@ def write_viewer_page(
     placed = model.placed and not cameras
     cameras = cameras or model.cameras
     entries = [camera_entry(camera, placed) for camera in cameras]
-    config = page_config([{"name": payload.name, "element": ELEMENT}], None, entries, virtual_scale)
+    entry = {"name": payload.name, "element": ELEMENT}
+    config = page_config([entry], None, entries, virtual_scale)
     with atomic_path(path) as temporary:
         if exact:
             data = b"".join(payload.blocks())
@@ -232,7 +234,8 @@ def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
     own.
     """
     scale = min(POSTER_SIDE / max(camera.width, camera.height), 1.0)
-    width, height = (max(round(scale * side), 1) for side in (camera.width, camera.height))
+    width = max(round(scale * camera.width), 1)
+    height = max(round(scale * camera.height), 1)
     small = camera.resized(width, height)
     dial = 1.0 if gaussians.sigma_d is None else virtual_scale
     image = Image.fromarray(render(gaussians, small, dial).pixels.cpu().numpy())
@@ -259,7 +262,8 @@ def up_axis(gaussians: Gaussians) -> np.ndarray:
     means = float64_array(g.means)
     scales = np.sort(g.log_scales.numpy(), axis=1)
     offsets = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    flat = (scales[:, 0] + FLAT < scales[:, 1]) & (offsets <= np.quantile(offsets, 0.98))
+    flat = scales[:, 0] + FLAT < scales[:, 1]
+    flat &= offsets <= np.quantile(offsets, 0.98)
     if not flat.any():
         return np.array(UPS[0])
     axes = rotations(g.quats[torch.from_numpy(flat)].double()).numpy()
@@ -278,12 +282,18 @@ def up_axis(gaussians: Gaussians) -> np.ndarray:
     return np.array(UPS[0])
 
 
+def _source_of(name: str) -> str:
+    """A source of the policy: the hash of a static file."""
+    digest = hashlib.sha256(_static_file(name).encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+
 def policy(connect: str = "") -> str:
     """The page's Content-Security-Policy; ``connect`` is a further source that it may fetch
     from.
     """
-    digests = [hashlib.sha256(_static_file(name).encode()).digest() for name in (SCRIPT, STYLE)]
-    script, style = (f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
+    script = _source_of(SCRIPT)
+    style = _source_of(STYLE)
     return (
         f"default-src 'none'; script-src {script}; style-src {style}; img-src data: blob:; "
         f"connect-src {connect} data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'"
@@ -304,7 +314,8 @@ def document(
         ),
         "SCRIPT": f'<script type="module">{_static_file(SCRIPT)}</script>',
     }
-    for number, piece in enumerate(re.split("<!--CLOD-([A-Z]+)-->", _static_file("page.html"))):
+    pieces = re.split("<!--CLOD-([A-Z]+)-->", _static_file("page.html"))
+    for number, piece in enumerate(pieces):
         if piece == "DATA":
             yield from data
         else:
@@ -315,12 +326,10 @@ def _elements(data: bytes) -> Iterator[bytes]:
     """Script elements with the bytes as base64; large data are divided among several with the same
     id.
     """
+    element = ELEMENT.encode()
     for start in range(0, len(data), PART):
         encoded = base64.b64encode(data[start : start + PART])
-        yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (
-            ELEMENT.encode(),
-            encoded,
-        )
+        yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (element, encoded)
 
 
 @cache
