@@ -2,6 +2,8 @@
 
 # gsplat's conventions, for all rasterizers: alpha below which nothing is drawn, largest alpha, and
 # the transmittance at which a pixel ends.
-ALPHA_MIN, ALPHA_MAX, T_MIN = 1 / 255, 0.999, 1e-4
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.999
+T_MIN = 1e-4
 # Shortest and longest quaternion that is drawn; readers drop others. Its square must fit float32.
 QUAT_MIN, QUAT_MAX = 1e-15, 1e15

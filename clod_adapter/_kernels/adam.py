@@ -53,7 +53,8 @@ def adam_rows(
     first = pointer(first)
     second = pointer(second)
     for start in range(begin, end, 16):
-        stop, any_marked = min(start + 16, end), False
+        stop = min(start + 16, end)
+        any_marked = False
         for row in range(start, stop):
             any_marked |= mask[row]
         if not any_marked:

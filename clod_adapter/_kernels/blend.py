@@ -73,7 +73,8 @@ def start_tile(ox, oy, tiles, state, stride, live):
     for word in range(WORDS):
         live[word] = uint64(0)
     for block in range(BLOCKS):
-        x, y = ox + (block % ACROSS) * BLOCK, oy + (block // ACROSS) * BLOCK
+        x = ox + (block % ACROSS) * BLOCK
+        y = oy + (block // ACROSS) * BLOCK
         if x < tiles.width and y < tiles.height:
             live[block // 64] |= uint64(1) << uint64(block % 64)
         inside = both(gt(tiles.width - x, load(LANE_X, 0)), gt(tiles.height - y, load(LANE_Y, 0)))
@@ -144,7 +145,8 @@ class Meeting(NamedTuple):
 @part
 def meet(g, t, block):
     """The ``Meeting`` of a Gaussian with the pixels of a block, whose transmittances are ``t``."""
-    dx, dy = g.base_x + BLOCK_X[block], g.base_y + BLOCK_Y[block]
+    dx = g.base_x + BLOCK_X[block]
+    dy = g.base_y + BLOCK_Y[block]
     along_x = fma(g.minus_qa, dx, g.minus_qb * dy)
     unlimited = exp2(fma(dx, along_x, fma(g.minus_qc * dy, dy, g.log)))
     alpha = vmin(unlimited, ALPHA_MAX)
@@ -221,7 +223,9 @@ def write_tile(ox, oy, tiles, state, background, picture):
     height = tiles.height
     part = scratch(float32, 64)
     for block in range(BLOCKS):
-        x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 64
+        x = ox + BLOCK * (block % ACROSS)
+        y = oy + BLOCK * (block // ACROSS)
+        at = block * 64
         if x >= width or y >= height:
             continue
         t = vabs(load(state, at))
@@ -246,7 +250,9 @@ def read_tile(ox, oy, tiles, picture, gradients, state):
     height = tiles.height
     part = scratch(float32, 80)
     for block in range(BLOCKS):
-        x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 80
+        x = ox + BLOCK * (block % ACROSS)
+        y = oy + BLOCK * (block // ACROSS)
+        at = block * 80
         if x >= width or y >= height:
             continue
         inside = x + BLOCK <= width and y + BLOCK <= height
@@ -335,7 +341,9 @@ def blend_gradient(
                     met = meet(g, t, block)
                     dx, dy = met.dx, met.dy
                     weight = select(met.blends, t * met.alpha, 0)
-                    v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
+                    v_r = load(state, at + 32)
+                    v_g = load(state, at + 48)
+                    v_b = load(state, at + 64)
                     q = fma(v_r, g.red, fma(v_g, g.green, v_b * g.blue))
                     if colored:
                         s_r = fma(weight, v_r, s_r)
@@ -349,7 +357,9 @@ def blend_gradient(
                     if shaped:
                         sx, sy = s * dx, s * dy
                         s_x, s_y = s_x + sx, s_y + sy
-                        s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
+                        s_xx = fma(sx, dx, s_xx)
+                        s_xy = fma(sx, dy, s_xy)
+                        s_yy = fma(sy, dy, s_yy)
                     after = select(met.ends, 0 - met.after, met.after)
                     store(state, at, select(met.blends, after, t))
             store_sums(pair_sums, slot * PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)

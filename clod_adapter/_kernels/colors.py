@@ -66,7 +66,9 @@ def sh_basis_gradient(degree, x, y, z, v):
     """Gradient of ``sum_k v[k] * basis_k`` with respect to (x, y, z) as free variables."""
     gx = gy = gz = splat(0)
     if degree >= 1:
-        gx, gy, gz = -C1 * v[3], -C1 * v[1], C1 * v[2]
+        gx = -C1 * v[3]
+        gy = -C1 * v[1]
+        gz = C1 * v[2]
     if degree >= 2:
         gx += C20 * (y * v[4] - z * v[7]) - 2 * C22 * x * v[6] + 2 * C24 * x * v[8]
         gy += C20 * (x * v[4] - z * v[5]) - 2 * C22 * y * v[6] - 2 * C24 * y * v[8]
@@ -122,7 +124,9 @@ def sh_basis_gradient(degree, x, y, z, v):
 @part
 def view_direction(w, cam, out):
     """Unit directions from the camera to the Gaussians into ``out[:3]``; returns 1 / distance."""
-    x, y, z = w[MEAN] - cam[EYE], w[MEAN + 1] - cam[EYE + 1], w[MEAN + 2] - cam[EYE + 2]
+    x = w[MEAN] - cam[EYE]
+    y = w[MEAN + 1] - cam[EYE + 1]
+    z = w[MEAN + 2] - cam[EYE + 2]
     inverse = 1 / vsqrt(x * x + y * y + z * z)
     out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
     return inverse
@@ -162,7 +166,9 @@ def color(first, count, stored, drawing, packed):
         sh_basis(drawing.degree, sh[0], sh[1], sh[2], basis)
         load_rows(stored.sh0, rows, 3, 0, 3, w, 0)
         load_sh(stored.shN, rows, terms, sh)
-        red, green, blue = 0.5 + basis[0] * w[0], 0.5 + basis[0] * w[1], 0.5 + basis[0] * w[2]
+        red = 0.5 + basis[0] * w[0]
+        green = 0.5 + basis[0] * w[1]
+        blue = 0.5 + basis[0] * w[2]
         for k in range(terms):
             red = fma(basis[k + 1], sh[3 * k], red)
             green = fma(basis[k + 1], sh[3 * k + 1], green)

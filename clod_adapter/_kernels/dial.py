@@ -47,7 +47,9 @@ NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 @part
 def squared_distance(w, cam):
     """Squared distances from the camera to the centres ``w[:3]``, world units^2."""
-    dx, dy, dz = w[0] - cam[EYE], w[1] - cam[EYE + 1], w[2] - cam[EYE + 2]
+    dx = w[0] - cam[EYE]
+    dy = w[1] - cam[EYE + 1]
+    dz = w[2] - cam[EYE + 2]
     return dx * dx + dy * dy + dz * dz
 
 

@@ -62,7 +62,8 @@ def log2(builder, x):
     # in [sqrt(1/2), sqrt(2))
     m = builder.bitcast(builder.sub(bits, builder.shl(exponent, _constant(23))), VECTOR)
     s = builder.fdiv(builder.fsub(m, _constant(1.0)), builder.fadd(m, _constant(1.0)))
-    square, p = builder.fmul(s, s), _constant(2 / math.log(2) / 9)
+    square = builder.fmul(s, s)
+    p = _constant(2 / math.log(2) / 9)
     for k in (7, 5, 3, 1):
         p = call_llvm(
             builder, "llvm.fmuladd.v16f32", VECTOR, [p, square, _constant(2 / math.log(2) / k)]

@@ -124,9 +124,12 @@ def covariance(cam, w):
     p3 = w[PMAT + 3]
     p4 = w[PMAT + 4]
     p5 = w[PMAT + 5]
-    xx, yy = p0 * p0 + p1 * p1 + p2 * p2, p3 * p3 + p4 * p4 + p5 * p5
+    xx = p0 * p0 + p1 * p1 + p2 * p2
+    yy = p3 * p3 + p4 * p4 + p5 * p5
     w[COV], w[COV + 1], w[COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
-    cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
+    cx = p1 * p5 - p2 * p4
+    cy = p2 * p3 - p0 * p5
+    cz = p0 * p4 - p1 * p3
     w[RAWDET] = cx * cx + cy * cy + cz * cz
     w[COVDET] = w[RAWDET] + blur * (xx + yy) + blur * blur
     return both(valid, gt(HUGE, w[COVDET]))
@@ -159,7 +162,9 @@ def centres(means, rows, cam, out):
     """
     for lane in range(16):
         at = 3 * rows[lane]
-        x, y, z = float64(means[at]), float64(means[at + 1]), float64(means[at + 2])
+        x = float64(means[at])
+        y = float64(means[at + 1])
+        z = float64(means[at + 2])
         depth = cam[8] * x + cam[9] * y + cam[10] * z + cam[11]
         inverse = float64(1) / depth
         out[lane] = cam[FX] * (cam[0] * x + cam[1] * y + cam[2] * z + cam[3]) * inverse + cam[CX]
@@ -174,7 +179,8 @@ def make_records(w, centre, opacity, cam, record):
     """Fills the sixteen columns of the records except the colours; returns which of them reach a
     pixel centre.
     """
-    mx, my = load(centre, 0), load(centre, 16)
+    mx = load(centre, 0)
+    my = load(centre, 16)
     idet = 1 / w[COVDET]
     record[MX], record[MY] = mx, my
     record[QA], record[QC] = (
@@ -188,7 +194,8 @@ def make_records(w, centre, opacity, cam, record):
     record[LOG] = log2(opacity)
     record[RED] = record[GREEN] = record[BLUE] = splat(0)
     reach = vmax(record[LOG] + LOG2_255, 0)
-    rx, ry = vsqrt(TWO_LN2 * reach * w[COV]), vsqrt(TWO_LN2 * reach * w[COV + 2])
+    rx = vsqrt(TWO_LN2 * reach * w[COV])
+    ry = vsqrt(TWO_LN2 * reach * w[COV + 2])
     record[REACH], record[RX] = reach, rx
     record[X0] = vmax(vceil(mx - rx - 0.5 - SLACK), 0)
     record[X1] = vmin(vfloor(mx + rx - 0.5 + SLACK), cam[WIDTH] - 1)

@@ -47,20 +47,25 @@ from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, stor
 def covariance_gradient(w, g, cam, compensated):
     """Gradients of scales, rotation matrix and mean from the sums over pixels."""
     idet = 1 / w[COVDET]
-    a, b, e = w[COV + 2] * idet, -(w[COV + 1] * idet), w[COV] * idet
+    a = w[COV + 2] * idet
+    b = -(w[COV + 1] * idet)
+    e = w[COV] * idet
     # dL/dP = K M (K P) with the conic K = [[a, b], [b, e]] and the second moments M of the sums. K
     # P comes from K = adj(P P^T + blur) / det term by term: for a needle, K times the long column
     # of P would cancel.
     for k in range(3):
-        p0, p1 = w[PMAT + k], w[PMAT + 3 + k]
-        t0, t1 = cam[BLUR] * p0, cam[BLUR] * p1
+        p0 = w[PMAT + k]
+        p1 = w[PMAT + 3 + k]
+        t0 = cam[BLUR] * p0
+        t1 = cam[BLUR] * p1
         for j in range(3):
             if j != k:  # else it is 0, except for the rounding of a fused product
                 cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
                 t0 += w[PMAT + 3 + j] * cross
                 t1 -= w[PMAT + j] * cross
         t0, t1 = t0 * idet, t1 * idet
-        m0, m1 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1, g[SUMS + 7] * t0 + g[SUMS + 8] * t1
+        m0 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1
+        m1 = g[SUMS + 7] * t0 + g[SUMS + 8] * t1
         g[V_P + k], g[V_P + 3 + k] = a * m0 + b * m1, b * m0 + e * m1
         if compensated is not None:
             compensation_gradient(w, g, k, t0, t1)
@@ -69,7 +74,8 @@ def covariance_gradient(w, g, cam, compensated):
             v = w[UMAT + d] * g[V_P + k] + w[UMAT + 3 + d] * g[V_P + 3 + k]
             g[V_SCALE + k] = g[V_SCALE + k] + v * w[ROT + 3 * d + k]
             g[V_ROT + 3 * d + k] = v * w[SCALE + k]
-    v_x, v_y = a * g[SUMS + 4] + b * g[SUMS + 5], b * g[SUMS + 4] + e * g[SUMS + 5]
+    v_x = a * g[SUMS + 4] + b * g[SUMS + 5]
+    v_y = b * g[SUMS + 4] + e * g[SUMS + 5]
     point_gradient(w, g, v_x, v_y, cam)
 
 
@@ -89,7 +95,8 @@ def compensation_gradient(w, g, k, t0, t1):
     for j in range(3):
         if j != k:
             cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
-            u0, u1 = u0 + w[PMAT + 3 + j] * cross, u1 - w[PMAT + j] * cross
+            u0 = u0 + w[PMAT + 3 + j] * cross
+            u1 = u1 - w[PMAT + j] * cross
     g[V_P + k] = g[V_P + k] + g[SUMS + 3] * (u0 * inverse - t0)
     g[V_P + 3 + k] = g[V_P + 3 + k] + g[SUMS + 3] * (u1 * inverse - t1)
 
@@ -99,7 +106,9 @@ def point_gradient(w, g, v_x, v_y, cam):
     """Adds the gradients through the projected centre and through the Jacobian to that of the
     mean.
     """
-    x, y, iz = w[POINT], w[POINT + 1], 1 / w[POINT + 2]
+    x = w[POINT]
+    y = w[POINT + 1]
+    iz = 1 / w[POINT + 2]
     rx, ry = x * iz, y * iz
     clamped_x = vmin(vmax(rx, cam[LOW_X]), cam[HIGH_X])
     clamped_y = vmin(vmax(ry, cam[LOW_Y]), cam[HIGH_Y])
@@ -108,17 +117,23 @@ def point_gradient(w, g, v_x, v_y, cam):
         u0 = u1 = splat(0)
         for k in range(3):
             q = w[ROT + 3 * d + k] * w[SCALE + k]
-            u0, u1 = u0 + g[V_P + k] * q, u1 + g[V_P + 3 + k] * q
-        j00, j02 = j00 + u0 * cam[d], j02 + u0 * cam[8 + d]
-        j11, j12 = j11 + u1 * cam[4 + d], j12 + u1 * cam[8 + d]
-    fx, fy = cam[FX] * iz, cam[FY] * iz
+            u0 = u0 + g[V_P + k] * q
+            u1 = u1 + g[V_P + 3 + k] * q
+        j00 = j00 + u0 * cam[d]
+        j02 = j02 + u0 * cam[8 + d]
+        j11 = j11 + u1 * cam[4 + d]
+        j12 = j12 + u1 * cam[8 + d]
+    fx = cam[FX] * iz
+    fy = cam[FY] * iz
     # The projected centre, then the factor 1/z of all four entries of the Jacobian.
     v_z = -(fx * rx * v_x + fy * ry * v_y) - iz * (
         fx * (j00 - clamped_x * j02) + fy * (j11 - clamped_y * j12)
     )
     v_rx = select(eq(clamped_x, rx), -(fx * j02 * iz), 0)
     v_ry = select(eq(clamped_y, ry), -(fy * j12 * iz), 0)
-    v_x, v_y, v_z = fx * v_x + v_rx, fy * v_y + v_ry, v_z - v_rx * rx - v_ry * ry
+    v_x = fx * v_x + v_rx
+    v_y = fy * v_y + v_ry
+    v_z = v_z - v_rx * rx - v_ry * ry
     for d in range(3):
         g[V_MEAN + d] = g[V_MEAN + d] + (cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z)
 
@@ -131,8 +146,12 @@ def quat_gradient(w, g):
     q2 = w[QUAT + 2]
     q3 = w[QUAT + 3]
     r = V_ROT
-    x, y, z = g[r + 7] - g[r + 5], g[r + 2] - g[r + 6], g[r + 3] - g[r + 1]
-    xy, xz, yz = g[r + 3] + g[r + 1], g[r + 6] + g[r + 2], g[r + 7] + g[r + 5]
+    x = g[r + 7] - g[r + 5]
+    y = g[r + 2] - g[r + 6]
+    z = g[r + 3] - g[r + 1]
+    xy = g[r + 3] + g[r + 1]
+    xz = g[r + 6] + g[r + 2]
+    yz = g[r + 7] + g[r + 5]
     v0 = 2 * (q1 * x + q2 * y + q3 * z)
     v1 = 2 * (q2 * xy + q3 * xz + q0 * x - 2 * q1 * (g[r + 4] + g[r + 8]))
     v2 = 2 * (q1 * xy + q3 * yz + q0 * y - 2 * q2 * (g[r] + g[r + 8]))
@@ -149,13 +168,18 @@ def color_gradient(w, g, shN, rows, drawing, sh, basis, tuned, v_shN):
     """
     degree = drawing.degree
     inverse = view_direction(w, drawing.cam, sh)
-    x, y, z = sh[0], sh[1], sh[2]
+    x = sh[0]
+    y = sh[1]
+    z = sh[2]
     sh_basis(degree, x, y, z, basis)
-    red, green, blue = g[SUMS], g[SUMS + 1], g[SUMS + 2]
+    red = g[SUMS]
+    green = g[SUMS + 1]
+    blue = g[SUMS + 2]
     terms = (degree + 1) * (degree + 1) - 1
     load_sh(shN, rows, terms, sh)
     for k in range(terms):
-        b, at = basis[k + 1], 3 * k
+        b = basis[k + 1]
+        at = 3 * k
         basis[k + 1] = sh[at] * red + sh[at + 1] * green + sh[at + 2] * blue
         sh[at], sh[at + 1], sh[at + 2] = b * red, b * green, b * blue
     if tuned:

@@ -81,19 +81,24 @@ def ssim_slopes(worker, workers, planes, width, sums):
                 q = load(planes.y, where)
                 tp, tq = tap * p, tap * q
                 m_x, m_y = m_x + tp, m_y + tq
-                m_xx, m_yy, m_xy = fma(tp, p, m_xx), fma(tq, q, m_yy), fma(tp, q, m_xy)
+                m_xx = fma(tp, p, m_xx)
+                m_yy = fma(tq, q, m_yy)
+                m_xy = fma(tp, q, m_xy)
             store(lines, at, m_x)
             store(lines, step + at, m_y)
             store(lines, 2 * step + at, m_xx)
             store(lines, 3 * step + at, m_yy)
             store(lines, 4 * step + at, m_xy)
         for at in range(PAD, step - PAD, 16):
-            mx, my = blur_row(lines, 0, at), blur_row(lines, step, at)
+            mx = blur_row(lines, 0, at)
+            my = blur_row(lines, step, at)
             sxx = blur_row(lines, 2 * step, at) - mx * mx
             syy = blur_row(lines, 3 * step, at) - my * my
             sxy = blur_row(lines, 4 * step, at) - mx * my
-            a, b = fma(2 * mx, my, C1), fma(2, sxy, C2)
-            c, d = fma(mx, mx, fma(my, my, C1)), sxx + syy + C2
+            a = fma(2 * mx, my, C1)
+            b = fma(2, sxy, C2)
+            c = fma(mx, mx, fma(my, my, C1))
+            d = sxx + syy + C2
             inverse = 1 / (c * d)
             value = a * b * inverse
             where = task * step + at

@@ -38,15 +38,20 @@ def spans(records, r, ox, oy, side):
     1/255. In a row of cells it is widest at its own leftmost and rightmost points where those lie
     in it, else at the nearer edge.
     """
-    mx, my, rx = records[r + MX] - 0.5, records[r + MY], records[r + RX]
-    qa, qb, qc = records[r + QA], records[r + QB], records[r + QC]
+    mx = records[r + MX] - 0.5
+    my = records[r + MY]
+    rx = records[r + RX]
+    qa = records[r + QA]
+    qb = records[r + QB]
+    qc = records[r + QC]
     row = load(ROWS, 0) * side + (float32(oy) + 0.5)
     top = vmax(row, records[r + Y0] + 0.5) - my
     bottom = vmin(row + (side - 1), records[r + Y1] + 0.5) - my
     tip = splat(-qb / (qc * float32(2)) * rx)
     det = records[r + DET]  # 4 QA QC - QB^2, from the covariance, where it does not cancel
     reach = float32(4) * qa * records[r + REACH]
-    right, left = vmin(vmax(tip, top), bottom), vmin(vmax(0 - tip, top), bottom)
+    right = vmin(vmax(tip, top), bottom)
+    left = vmin(vmax(0 - tip, top), bottom)
     wide = vsqrt(vmax(reach - det * right * right, 0))
     x1 = select(eq(right, tip), rx, (wide - qb * right) * (0.5 / qa))
     wide = vsqrt(vmax(reach - det * left * left, 0))
@@ -106,7 +111,8 @@ def tiles_across(records, r, ty, y0, y1, columns):
             low, high = spans(records, r, 0, ty * TILE, float32(TILE))
             store(columns, 0, low)
             store(columns, 16, high)
-        first, last = np.int32(columns[lane]), np.int32(columns[16 + lane])
+        first = np.int32(columns[lane])
+        last = np.int32(columns[16 + lane])
     return first, last
 
 
@@ -150,7 +156,8 @@ def list_tiles(
         prefetch(records, order[min(j + AHEAD, last - 1)] * RECORD)
         p = order[j]
         r = p * RECORD
-        y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
+        y0 = np.int32(records[r + Y0])
+        y1 = np.int32(records[r + Y1])
         if listed:
             slots[2 * p] = slot
         for ty in range(y0 // TILE, y1 // TILE + 1):
