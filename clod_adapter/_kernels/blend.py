@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float32, uint64
 
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.conventions import (
     AHEAD,
     ALPHA_MAX,
@@ -67,7 +67,7 @@ LANE_Y = np.repeat(np.arange(4, dtype=np.float32) + 0.5, 4)
 LAST = float32(ACROSS - 1)
 
 
-@part
+@inlined
 def start_tile(ox, oy, tiles, state, stride, live):
     """Marks blocks with pixels in the image as live, pixels outside as finished."""
     for word in range(WORDS):
@@ -81,7 +81,7 @@ def start_tile(ox, oy, tiles, state, stride, live):
         store(state, block * stride, select(inside, 1, -1))
 
 
-@part
+@inlined
 def none_set(words, at):
     """Whether the WORDS words from ``at`` on are 0."""
     any_set = uint64(0)
@@ -90,7 +90,7 @@ def none_set(words, at):
     return any_set == uint64(0)
 
 
-@part
+@inlined
 def find_blocks(records, r, ox, oy, masks, at):
     """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r``
     touches.
@@ -114,7 +114,7 @@ class Spread(NamedTuple):
     blue: Any
 
 
-@part
+@inlined
 def spread(records, r, ox, oy):
     """The record at ``r`` in a tile that begins at (ox, oy)."""
     return Spread(
@@ -142,7 +142,7 @@ class Meeting(NamedTuple):
     ends: Any  # which pixels it finishes
 
 
-@part
+@inlined
 def meet(g, t, block):
     """The ``Meeting`` of a Gaussian with the pixels of a block, whose transmittances are ``t``."""
     dx = g.base_x + BLOCK_X[block]
@@ -216,12 +216,12 @@ def blend(worker, workers, tiles, cursor, room, background, picture):
         write_tile(ox, oy, tiles, state, background, picture)
 
 
-@part
+@inlined
 def write_tile(ox, oy, tiles, state, background, picture):
     """Composites the tile over the background into the picture."""
     width = tiles.width
     height = tiles.height
-    part = scratch(float32, 64)
+    block_values = scratch(float32, 64)
     for block in range(BLOCKS):
         x = ox + BLOCK * (block % ACROSS)
         y = oy + BLOCK * (block // ACROSS)
@@ -231,24 +231,24 @@ def write_tile(ox, oy, tiles, state, background, picture):
         t = vabs(load(state, at))
         for channel in range(3):
             color = fma(t, background[channel], load(state, at + 16 + 16 * channel))
-            store(part, 16 * channel, color)
-        store(part, 48, 1 - t)
+            store(block_values, 16 * channel, color)
+        store(block_values, 48, 1 - t)
         for lane in range(16):
             if x + lane % 4 < width and y + lane // 4 < height:
                 pixel = (y + lane // 4) * width + x + lane % 4
-                picture.alpha[pixel] = part[48 + lane]
+                picture.alpha[pixel] = block_values[48 + lane]
                 for channel in range(3):
-                    picture.image[3 * pixel + channel] = part[16 * channel + lane]
+                    picture.image[3 * pixel + channel] = block_values[16 * channel + lane]
 
 
-@part
+@inlined
 def read_tile(ox, oy, tiles, picture, gradients, state):
     """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three
     channels.
     """
     width = tiles.width
     height = tiles.height
-    part = scratch(float32, 80)
+    block_values = scratch(float32, 80)
     for block in range(BLOCKS):
         x = ox + BLOCK * (block % ACROSS)
         y = oy + BLOCK * (block // ACROSS)
@@ -259,20 +259,24 @@ def read_tile(ox, oy, tiles, picture, gradients, state):
         for lane in range(16):
             if inside or (x + lane % 4 < width and y + lane // 4 < height):
                 pixel = (y + lane // 4) * width + x + lane % 4
-                left = -gradients.alpha[pixel] * (float32(1) - picture.alpha[pixel])
-                part[lane] = left
+                remainder = -gradients.alpha[pixel] * (float32(1) - picture.alpha[pixel])
+                block_values[lane] = remainder
                 for channel in range(3):
                     slope = gradients.image[3 * pixel + channel]
                     color = picture.image[3 * pixel + channel]
                     state[at + 32 + 16 * channel + lane] = slope
-                    part[16 + 16 * channel + lane] = color
-                    left += slope * color
-                state[at + 16 + lane] = left
+                    block_values[16 + 16 * channel + lane] = color
+                    remainder += slope * color
+                state[at + 16 + lane] = remainder
         if inside:  # in vectors: the last bits of the result have always been these
-            rest = load(part, 0)
+            behind = load(block_values, 0)
             for channel in range(2, -1, -1):
-                rest = fma(load(state, at + 32 + 16 * channel), load(part, 16 + 16 * channel), rest)
-            store(state, at + 16, rest)
+                behind = fma(
+                    load(state, at + 32 + 16 * channel),
+                    load(block_values, 16 + 16 * channel),
+                    behind,
+                )
+            store(state, at + 16, behind)
 
 
 @kernel
@@ -349,9 +353,9 @@ def blend_gradient(
                         s_r = fma(weight, v_r, s_r)
                         s_g = fma(weight, v_g, s_g)
                         s_b = fma(weight, v_b, s_b)
-                    rest = load(state, at + 16) - weight * q
-                    store(state, at + 16, rest)
-                    v_a = t * q - rest / (1 - met.alpha)
+                    behind = load(state, at + 16) - weight * q
+                    store(state, at + 16, behind)
+                    v_a = t * q - behind / (1 - met.alpha)
                     s = select(both(met.blends, ge(ALPHA_MAX, met.unlimited)), v_a * met.alpha, 0)
                     s_0 = s_0 + s
                     if shaped:

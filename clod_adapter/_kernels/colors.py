@@ -4,7 +4,7 @@ Gaussians at a time.
 
 from numba import float32, int64, uint64
 
-from clod_adapter._kernels.compiling import part
+from clod_adapter._kernels.compiling import inlined
 from clod_adapter._kernels.conventions import EYE, HUGE, MEAN, RECORD, RED
 from clod_adapter._kernels.elementary import bits_of, vabs, vsqrt
 from clod_adapter._kernels.pointers import load_rows, scratch, store_rows
@@ -29,7 +29,7 @@ C46 = float32(0.47308734787878004)
 C48 = float32(0.6258357354491761)
 
 
-@part
+@inlined
 def sh_basis(degree, x, y, z, out):
     """Values of the (degree + 1)^2 basis functions in the unit direction (x, y, z)."""
     out[0] = splat(C0)
@@ -61,7 +61,7 @@ def sh_basis(degree, x, y, z, out):
     out[24] = C48 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy))
 
 
-@part
+@inlined
 def sh_basis_gradient(degree, x, y, z, v):
     """Gradient of ``sum_k v[k] * basis_k`` with respect to (x, y, z) as free variables."""
     gx = gy = gz = splat(0)
@@ -121,7 +121,7 @@ def sh_basis_gradient(degree, x, y, z, v):
     return gx, gy, gz
 
 
-@part
+@inlined
 def view_direction(w, cam, out):
     """Unit directions from the camera to the Gaussians into ``out[:3]``; returns 1 / distance."""
     x = w[MEAN] - cam[EYE]
@@ -132,7 +132,7 @@ def view_direction(w, cam, out):
     return inverse
 
 
-@part
+@inlined
 def load_sh(shN, rows, terms, w):
     """Loads the ``terms`` harmonics above degree 0 of sixteen rows, three channels each, into
     ``w``.
@@ -141,7 +141,7 @@ def load_sh(shN, rows, terms, w):
         load_rows(shN, rows, 3 * terms, first, min(3 * terms - first, 16), w, first)
 
 
-@part
+@inlined
 def color(first, count, stored, drawing, packed):
     """Writes the colours ``max(0, 0.5 + SH)`` of ``count`` packed records from ``first`` on;
     returns how many remain: only finite ones.

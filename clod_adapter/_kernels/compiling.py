@@ -99,4 +99,4 @@ class _Inlining(CompilerBase):  # type: ignore[misc]
 
 # Always inlined: a call would pass seven words on the stack per array. Only kernels call it: Python
 # would crash.
-part = njit(forceinline=True, no_cpython_wrapper=True, pipeline_class=_Inlining, **OPTIONS)  # type: ignore[call-overload]
+inlined = njit(forceinline=True, no_cpython_wrapper=True, pipeline_class=_Inlining, **OPTIONS)  # type: ignore[call-overload]

@@ -4,7 +4,7 @@ at a time.
 
 from numba import float32
 
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.dial import squared_reach, survives
 from clod_adapter._kernels.elementary import bits_of, ones
 from clod_adapter._kernels.pointers import first_lanes, load_some, pointer, share, store_some
@@ -13,7 +13,7 @@ from clod_adapter._kernels.simd import both, gt, select, vmax, vmin
 DOUBLINGS = 5  # of the exponent 1 of t: 2^5 is target_count.SHARPNESS
 
 
-@part
+@inlined
 def load_squares(i, many, sigma, d, dial2):
     """``sigma`` and (d s)^2 of at most sixteen of ``many`` rows from ``i`` on; ``dial2`` is s^2."""
     d = load_some(d, i, many)

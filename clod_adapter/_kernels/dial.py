@@ -7,7 +7,7 @@ one at its end may be judged otherwise than by the equation, with an opacity of 
 
 from numba import float32, uint64
 
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.conventions import (
     ALPHA_MIN,
     EYE,
@@ -44,7 +44,7 @@ LOG2_GROWTH_MAX = float32(20 * 1.4426950408889634)  # attenuation.LOG_GROWTH_MAX
 NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
 
-@part
+@inlined
 def squared_distance(w, cam):
     """Squared distances from the camera to the centres ``w[:3]``, world units^2."""
     dx = w[0] - cam[EYE]
@@ -53,43 +53,43 @@ def squared_distance(w, cam):
     return dx * dx + dy * dy + dz * dz
 
 
-@part
+@inlined
 def squared_reach(sigma, far2):
     """``R^2``; 1 where d s, of which ``far2`` is the square, is 0."""
     sigma = vmax(sigma, 0)
     return select(gt(far2, 0), sigma * sigma, 1)
 
 
-@part
+@inlined
 def takeover(far2, near2):
     """w, before it is clamped to [0, 1]."""
     return far2 * near2 * TAKEOVER - (TAKEOVER - 1)
 
 
-@part
+@inlined
 def survives(sigma, far2, near2):
     """A mask of the rows, of sixteen, that the dial keeps."""
     end2 = squared_reach(sigma, far2)
     if near2 > 0:
         far = gt(sigma, 0)
-        begun = select(far, takeover(far2, near2), 1)
-        return both(gt(begun, 0), gt(select(far, end2, 1 / near2), far2))
+        takeover_share = select(far, takeover(far2, near2), 1)
+        return both(gt(takeover_share, 0), gt(select(far, end2, 1 / near2), far2))
     return gt(end2, far2)
 
 
-@part
+@inlined
 def squared_share(sigma, far2):
     """``t^2``, at most 1."""
     return vmin(far2 / squared_reach(sigma, far2), 1)
 
 
-@part
+@inlined
 def reciprocal_opacity(logit):
     """``1 / sigmoid(logit)``."""
     return 1 + exp2(vmin(-logit * LOG2E, FARTHEST_EXPONENT))
 
 
-@part
+@inlined
 def kept(at, many, stored, drawing):
     """The bits of those of ``many`` <= 16 rows from ``at`` on that are in front of the camera and
     not culled.
@@ -131,7 +131,7 @@ def mark_kept(worker, workers, means, sigma, cam, dial, out):
             out[i + lane] = (bits >> uint64(lane)) & uint64(1)
 
 
-@part
+@inlined
 def drawn(rows, stored, drawing, w):
     """The drawn opacities of sixteen rows, whose centres and logarithms of scales ``w`` holds;
     makes these scales.
@@ -151,8 +151,8 @@ def drawn(rows, stored, drawing, w):
         share2 = squared_share(reach, far2)
         fade = 1 - share2 * share2
         if dial[NEAR2] > 0:
-            taken = vmin(1, vmax(0, takeover(far2, dial[NEAR2])))
-            fade = select(gt(reach, 0), fade * taken, 1 - taken)
+            takeover_share = vmin(1, vmax(0, takeover(far2, dial[NEAR2])))
+            fade = select(gt(reach, 0), fade * takeover_share, 1 - takeover_share)
         opacity = opacity * fade
         if drawing.grows:
             size = gather(stored.growth, rows) * log2_magnification(distance2, dial)
@@ -163,13 +163,13 @@ def drawn(rows, stored, drawing, w):
     return opacity
 
 
-@part
+@inlined
 def log2_magnification(distance2, dial):
     """``log2 m``, of squared distances in world units^2."""
     return 0.5 * log2(vmax(distance2 * dial[GROWTH_RATE2], 1))
 
 
-@part
+@inlined
 def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
     """Gradients of logit, sigma and growth of sixteen rows; makes those of the scales in ``g`` of
     their logarithms.

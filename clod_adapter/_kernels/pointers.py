@@ -10,7 +10,7 @@ from numba import float32, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from clod_adapter._kernels.compiling import part
+from clod_adapter._kernels.compiling import inlined
 from clod_adapter._kernels.simd import (
     INTEGERS,
     LANES,
@@ -94,7 +94,7 @@ def count_up(builder, counter):
     return builder.atomic_rmw("add", counter, ir.Constant(I64, 1), "monotonic")
 
 
-@part
+@inlined
 def share(worker, workers, n):
     """The first of n rows that a worker takes, and the first that the next one takes."""
     return n * worker // workers, n * (worker + 1) // workers
@@ -137,13 +137,13 @@ def _first(builder, count):
 first_lanes = operation(mask16, types.int64)(_first)  # the first ``count`` of sixteen
 
 
-@part
+@inlined
 def load_some(values, index, count):
     """The first ``count`` of ``values[index : index + 16]``, then 0; what is beyond is not read."""
     return load(values, index) if count >= 16 else load_where(first_lanes(count), values, index)
 
 
-@part
+@inlined
 def store_some(values, index, count, vector):
     """Stores the first ``count`` lanes."""
     if count >= 16:
@@ -152,7 +152,7 @@ def store_some(values, index, count, vector):
         store_where(first_lanes(count), values, index, vector)
 
 
-@part
+@inlined
 def gather(values, rows):
     """``values[rows[lane]]`` in each lane."""
     lanes = scratch(float32, 16)
@@ -161,13 +161,13 @@ def gather(values, rows):
     return load(lanes, 0)
 
 
-@part
+@inlined
 def scatter(values, rows, vector):
     """The inverse of ``gather``; of rows that are listed twice the last is stored."""
-    given = scratch(float32, 16)
-    store(given, 0, vector)
+    values_of_lanes = scratch(float32, 16)
+    store(values_of_lanes, 0, vector)
     for lane in range(16):
-        values[rows[lane]] = given[lane]
+        values[rows[lane]] = values_of_lanes[lane]
 
 
 def _transposed(builder, rows):
@@ -229,11 +229,13 @@ def _split_triples(builder, lanes):
         two = builder.shuffle_vector(
             a, b, ir.Constant(INTEGERS, [min(o, 2 * LANES - 1) for o in order])
         )
-        rest = [lane if o < 2 * LANES else o - LANES for lane, o in enumerate(order)]
-        builder.store(builder.shuffle_vector(two, c, ir.Constant(INTEGERS, rest)), address, align=4)
+        sources = [lane if o < 2 * LANES else o - LANES for lane, o in enumerate(order)]
+        builder.store(
+            builder.shuffle_vector(two, c, ir.Constant(INTEGERS, sources)), address, align=4
+        )
 
 
-@part
+@inlined
 def load_triples(source, row, count, lanes):
     """``lanes[k]`` = column k of ``count`` <= 16 consecutive rows of ``source [*, 3]``, then 0."""
     for k in range(3):
@@ -242,10 +244,10 @@ def load_triples(source, row, count, lanes):
 
 
 @operation(types.none, FLOATS, types.int64, *[f32x16] * 9)
-def store_sums(builder, values, index, *given):
+def store_sums(builder, values, index, *summands):
     """``values[index : index + 9]`` = the sums over the lanes of the nine vectors."""
-    vectors = list(given)
-    nine = _first(builder, ir.Constant(I64, len(given)))
+    vectors = list(summands)
+    nine = _first(builder, ir.Constant(I64, len(summands)))
     even, odd = (ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))) for k in range(2))
     while len(vectors) > 1:  # adds neighbouring lanes until one vector holds all the sums, in order
         vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors

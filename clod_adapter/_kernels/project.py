@@ -9,7 +9,7 @@ dropped. Sixteen Gaussians at a time, one per lane.
 from numba import float32, float64, int64, uint64
 
 from clod_adapter._kernels.colors import color
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.conventions import (
     ALPHA_MIN,
     BLUE,
@@ -76,7 +76,7 @@ from clod_adapter._kernels.pointers import (
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, vmin
 
 
-@part
+@inlined
 def load_stored(stored, rows, w):
     """Loads what is stored of sixteen rows into the workspace ``w``."""
     load_rows(stored.means, rows, 3, 0, 3, w, MEAN)
@@ -84,7 +84,7 @@ def load_stored(stored, rows, w):
     load_rows(stored.scales, rows, 3, 0, 3, w, SCALE)
 
 
-@part
+@inlined
 def covariance(cam, w):
     """Fills the rest of the workspace ``w``; returns which are in front of the near plane and have
     a rotation.
@@ -135,7 +135,7 @@ def covariance(cam, w):
     return both(valid, gt(HUGE, w[COVDET]))
 
 
-@part
+@inlined
 def rotation(w):
     """Rotation matrix, row-major, of the unit quaternion."""
     q0 = w[QUAT]
@@ -153,7 +153,7 @@ def rotation(w):
     w[ROT + 8] = 1 - 2 * (q1 * q1 + q2 * q2)
 
 
-@part
+@inlined
 def centres(means, rows, cam, out):
     """Sixteen centres on the image, x then y in pixels, and their depths, into ``out [48]``.
 
@@ -174,7 +174,7 @@ def centres(means, rows, cam, out):
         out[32 + lane] = depth
 
 
-@part
+@inlined
 def make_records(w, centre, opacity, cam, record):
     """Fills the sixteen columns of the records except the colours; returns which of them reach a
     pixel centre.
@@ -204,7 +204,7 @@ def make_records(w, centre, opacity, cam, record):
     return both(drawn, both(ge(record[X1], record[X0]), ge(record[Y1], record[Y0])))
 
 
-@part
+@inlined
 def add_records(rows, filled, at, spare, means, opacity, cam, w, packed):
     """Packs those of the first ``filled`` of sixteen ``rows`` that reach a pixel centre, from the
     record ``at`` on.

@@ -5,7 +5,7 @@ Gaussian.
 from numba import float32, int64
 
 from clod_adapter._kernels.colors import C0, load_sh, sh_basis, sh_basis_gradient, view_direction
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.conventions import (
     BLUR,
     COV,
@@ -43,7 +43,7 @@ from clod_adapter._kernels.project import covariance, load_stored
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
 
 
-@part
+@inlined
 def covariance_gradient(w, g, cam, compensated):
     """Gradients of scales, rotation matrix and mean from the sums over pixels."""
     idet = 1 / w[COVDET]
@@ -79,7 +79,7 @@ def covariance_gradient(w, g, cam, compensated):
     point_gradient(w, g, v_x, v_y, cam)
 
 
-@part
+@inlined
 def compensation_gradient(w, g, k, t0, t1):
     """Adds the gradient through the compensation c to column k of P: that of log c is
     ``(P P^T)^-1 P - K P``.
@@ -101,7 +101,7 @@ def compensation_gradient(w, g, k, t0, t1):
     g[V_P + 3 + k] = g[V_P + 3 + k] + g[SUMS + 3] * (u1 * inverse - t1)
 
 
-@part
+@inlined
 def point_gradient(w, g, v_x, v_y, cam):
     """Adds the gradients through the projected centre and through the Jacobian to that of the
     mean.
@@ -138,7 +138,7 @@ def point_gradient(w, g, v_x, v_y, cam):
         g[V_MEAN + d] = g[V_MEAN + d] + (cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z)
 
 
-@part
+@inlined
 def quat_gradient(w, g):
     """Gradient of the stored quaternion from that of the rotation matrix."""
     q0 = w[QUAT]
@@ -161,7 +161,7 @@ def quat_gradient(w, g):
     g[V_QUAT + 2], g[V_QUAT + 3] = (v2 - along * q2) * w[QINV], (v3 - along * q3) * w[QINV]
 
 
-@part
+@inlined
 def color_gradient(w, g, shN, rows, drawing, sh, basis, tuned, v_shN):
     """Gradients of the harmonics above degree 0 if ``tuned``, and of the mean through the
     direction.
@@ -191,14 +191,14 @@ def color_gradient(w, g, shN, rows, drawing, sh, basis, tuned, v_shN):
     g[V_MEAN + 2] = (gz - along * z) * inverse
 
 
-@part
+@inlined
 def clear(values, first, last, width):
     """Sets the rows from ``first`` up to ``last``, of ``width`` elements, to 0."""
     for k in range(first * width, last * width):
         values[k] = 0
 
 
-@part
+@inlined
 def no_gradient(first, last, shaped, colored, terms, gradients):
     """Sets the gradients of the rows from ``first`` up to ``last``, which are not visible, to 0."""
     clear(gradients.opacities, first, last, 1)
@@ -209,7 +209,7 @@ def no_gradient(first, last, shaped, colored, terms, gradients):
     clear(gradients.shN, first, last, 3 * terms)
 
 
-@part
+@inlined
 def add_slots(pair_sums, slots, records, places, lanes, sums, g):
     """Sums the slots of sixteen packed Gaussians into ``g[SUMS]`` and into the rows of
     ``sums [16, 16]``.

@@ -82,11 +82,11 @@ def spread(builder, value, kind=VECTOR):
         value = builder.sitofp(value, kind.element)
     elif value.type == ir.DoubleType():
         value = builder.fptrunc(value, kind.element)
-    one = builder.insert_element(
+    single = builder.insert_element(
         ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0)
     )
     return builder.shuffle_vector(
-        one, ir.Constant(kind, ir.Undefined), ir.Constant(INTEGERS, [0] * LANES)
+        single, ir.Constant(kind, ir.Undefined), ir.Constant(INTEGERS, [0] * LANES)
     )
 
 
@@ -134,15 +134,15 @@ def operation(result, *kinds):
                 spread(builder, arg) if kind == f32x16 else arg
                 for arg, kind in zip(args, kinds, strict=True)
             ]
-            made = build(builder, *values)
-            return context.get_dummy_value() if made is None else made
+            value = build(builder, *values)
+            return context.get_dummy_value() if value is None else value
 
         def typed(typingctx, *args):
-            given = [
+            argument_types = [
                 arg if kind == f32x16 and arg in _numbers else kind
                 for arg, kind in zip(args, kinds, strict=True)
             ]
-            return result(*given), codegen
+            return result(*argument_types), codegen
 
         names = [f"given_{k}" for k in range(1 + len(kinds))]
         parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]

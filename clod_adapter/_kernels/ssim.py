@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float32
 
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.pointers import pointers, share
 from clod_adapter._kernels.simd import fma, load, splat, store
 
@@ -50,7 +50,7 @@ def to_planes(worker, workers, image, target, planes):
                 planes.y[channel, row, PAD + column] = byte * BYTE
 
 
-@part
+@inlined
 def blur_row(lines, line, length):
     """Horizontal blur of 16 columns from ``line`` of a row buffer."""
     out = splat(0)

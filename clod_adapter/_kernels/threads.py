@@ -49,12 +49,12 @@ def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
     if workers == 1:
         kernel(0, 1, *arguments)
         return
-    others = list[Future[None]]()
+    futures = list[Future[None]]()
     try:
         for worker in range(1, workers):
-            others.append(submit(shared(), kernel, worker, workers, *arguments))
+            futures.append(submit(shared(), kernel, worker, workers, *arguments))
         kernel(0, workers, *arguments)
     finally:
-        wait(others)  # also when interrupted: no thread may write into arrays that are returned
-    for other in others:
-        other.result()
+        wait(futures)  # also when interrupted: no thread may write into arrays that are returned
+    for future in futures:
+        future.result()

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import float32
 
-from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.conventions import (
     AHEAD,
     DET,
@@ -29,7 +29,7 @@ from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, store,
 ROWS = np.arange(16, dtype=np.float32)
 
 
-@part
+@inlined
 def spans(records, r, ox, oy, side):
     """Columns of cells that the ellipse of the record at ``r`` touches in sixteen rows of cells.
 
@@ -96,7 +96,7 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):
     return order
 
 
-@part
+@inlined
 def tiles_across(records, r, ty, y0, y1, columns):
     """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none:
     last < first.
