@@ -31,8 +31,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.nerfstudio.splatfacto import (
     camera_of,
     chosen,
+    drawn_parameters,
     new_dial,
-    shown,
     state_of,
     trained_rates,
     write_ply,
@@ -86,7 +86,7 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 
     config: ClodSplatfactoModelConfig
     dial: Dial | None
-    _shown: Mapping[str, Tensor] = {}
+    _drawn_parameters: Mapping[str, Tensor] = {}
 
     def populate_modules(self) -> None:
         super().populate_modules()
@@ -108,25 +108,27 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 
     @property
     def means(self) -> Tensor:
-        return self._shown.get("means", super().means)
+        return self._drawn_parameters.get("means", super().means)
 
     @property
     def scales(self) -> Tensor:
-        return self._shown.get("scales", super().scales)
+        return self._drawn_parameters.get("scales", super().scales)
 
     @property
     def opacities(self) -> Tensor:
-        return self._shown.get("opacities", super().opacities)
+        return self._drawn_parameters.get("opacities", super().opacities)
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
         if self.dial is None or not isinstance(camera, Cameras):
             return super().get_outputs(camera)  # type: ignore[no-any-return]
         self.virtual_scale = self.dial.sample() if self.training else float(self.slider.value)
-        self._shown = shown(self.gauss_params, self.dial, camera_of(camera), self.virtual_scale)
+        self._drawn_parameters = drawn_parameters(
+            self.gauss_params, self.dial, camera_of(camera), self.virtual_scale
+        )
         try:
             return super().get_outputs(camera)  # type: ignore[no-any-return]
         finally:
-            self._shown = {}
+            self._drawn_parameters = {}
 
     def get_loss_dict(
         self, outputs: Any, batch: Any, metrics_dict: Any = None

@@ -42,7 +42,7 @@ def camera_of(camera: Any) -> Camera:
     return Camera(viewmat, K, int(number("width")), int(number("height")))
 
 
-def shown(
+def drawn_parameters(
     parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_scale: float
 ) -> dict[str, Tensor]:
     """Tensors that splatfacto is to draw in place of its ``means``, ``scales`` and ``opacities``

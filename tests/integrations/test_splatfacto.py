@@ -17,8 +17,8 @@ from clod_adapter.integrations.splats import from_gsplat, to_gsplat
 from clod_adapter.nerfstudio.splatfacto import (
     camera_of,
     chosen,
+    drawn_parameters,
     new_dial,
-    shown,
     state_of,
     write_ply,
 )
@@ -106,7 +106,7 @@ def test_splatfacto_draws_what_render_draws(parameters, dial, cameras):
     camera, model = cameras[1], dial.gaussians()
     plain = model.replace(sigma_d=None, growth_d=None, attenuation=None)
     for scale in (1.0, 5.0):
-        changed = shown(parameters, dial, camera, scale)
+        changed = drawn_parameters(parameters, dial, camera, scale)
         assert all(value.shape == parameters[name].shape for name, value in changed.items())
         logits = changed["opacities"][:, 0].nan_to_num()
         drawn = plain.replace(
