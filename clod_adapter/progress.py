@@ -93,7 +93,7 @@ def tell(listener: Listener | None, phase: Phase, done: int, total: int) -> None
 
 
 @contextmanager
-def shown(progress: Listener | Literal[False] | None) -> Iterator[Listener | None]:
+def progress_bar(progress: Listener | Literal[False] | None) -> Iterator[Listener | None]:
     """The listener ``progress``. For None a bar, where stderr is a terminal or a notebook's; for
     False none.
     """

@@ -28,7 +28,7 @@ from clod_adapter.initialization.importance import (
     usable_views,
 )
 from clod_adapter.integrations.splats import NAMES, from_gsplat
-from clod_adapter.progress import Listener, shown
+from clod_adapter.progress import Listener, progress_bar
 from clod_adapter.training.far import with_far
 from clod_adapter.training.optimizer import learning_rates, own_sizes
 from clod_adapter.training.schedule import FAR, OURS, Schedule, ViewSampler
@@ -329,7 +329,7 @@ def attach(
     base = base.replace(**{name: value.detach() for name, value in base.tensors().items()})
     require_trainable(base, Scene(views, ()), config)
     views = usable_views(base, views)
-    with shown(progress) as listener:
+    with progress_bar(progress) as listener:
         start = for_training(initialize(base, views, config, listener))
     return Dial(splats, start, [view.camera for view in views], config)
 

@@ -14,7 +14,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, LossNotFinite, largest_colour
 from clod_adapter.initialization.importance import for_training, usable_views
-from clod_adapter.progress import GracefulStop, Listener, Phase, Progress, shown
+from clod_adapter.progress import GracefulStop, Listener, Phase, Progress, progress_bar
 from clod_adapter.training.dial import require_trainable
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.paper import form_of
@@ -95,7 +95,7 @@ def adapt(
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     reduced = base if config.lr_shN > 0 else base.without_empty_bands()
     views = usable_views(reduced, scene.train)
-    with shown(False if progress is None and group and group.rank else progress) as listener:
+    with progress_bar(False if progress is None and group and group.rank else progress) as listener:
         # for a resumed run too, the same again
         start = _initialized(reduced, views, config, listener, group)
         empty_sh = None if reduced is base else base.shN.clone()
