@@ -164,8 +164,10 @@ def _climb(
         moves = step * unit * torch.eye(3, dtype=focus.dtype).repeat_interleave(2, 0)
         moves[1::2] *= -1
         neighbours = [_placed(frame.scale, frame.offset + move) for move in moves]
-        for by in (1 + step, 1 / (1 + step)):
-            neighbours.append(_placed(frame.scale * by, focus - by * (focus - frame.offset)))
+        for factor in (1 + step, 1 / (1 + step)):
+            neighbours.append(
+                _placed(frame.scale * factor, focus - factor * (focus - frame.offset))
+            )
         for neighbour in neighbours:
             trials += 1
             if (value := score(neighbour)) > best:

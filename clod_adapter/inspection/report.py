@@ -266,7 +266,7 @@ def _inspect_tensors(path: Path) -> Inspection | None:
         about = {
             "kind": "state",
             "writer": None,
-            "count": next((len(t) for t in state.tensors.values() if t.ndim), 0),
+            "count": next((len(tensor) for tensor in state.tensors.values() if tensor.ndim), 0),
             "steps": state.steps,
             "seconds": state.seconds,
             "loss": state.loss,

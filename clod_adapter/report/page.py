@@ -98,8 +98,8 @@ def write_page(
     }
     settings |= {"version": report["version"], **report["machine"], "device": report["device"]}
     settings |= {f"{name}, seconds": f"{value:.1f}" for name, value in report["seconds"].items()}
-    few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4))
-    strip = [*others.values(), *(frames[k] for k in few)] if frames else []
+    chosen_frames = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4))
+    strip = [*others.values(), *(frames[k] for k in chosen_frames)] if frames else []
     source = files("clod_adapter.report")
     template = (source / "page.html").read_text("utf-8")
     page = (

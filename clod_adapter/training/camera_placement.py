@@ -91,7 +91,7 @@ def place_cameras(
     while (
         views is None
         and len(cameras) + VIEWS <= MOST
-        and placement.shown_share(cameras[-VIEWS:]) < SHOWN
+        and placement.covered_share(cameras[-VIEWS:]) < SHOWN
     ):
         try:
             cameras += placement.round(VIEWS)
@@ -110,7 +110,7 @@ class _Placement:
         self, plain: Gaussians, seed: int, field: float, progress: Listener | None
     ) -> None:
         usable = _usable(plain)
-        self.few, self.growth = _sample(plain, usable, seed)
+        self.sample, self.growth = _sample(plain, usable, seed)
         self.zoom = 0.5 / math.tan(math.radians(field) / 2)  # the focal length in image widths
         # The distance, world units, at which the smallest tenth is at most SMALL_PIXELS pixels
         # large.
@@ -124,7 +124,7 @@ class _Placement:
         self.judged = 0  # candidates so far
         # Each row stands for growth^2 of the checkpoint's.
         self.weight = (
-            self.few.opacities if self.growth is None else self.few.opacities * self.growth**2
+            self.sample.opacities if self.growth is None else self.sample.opacities * self.growth**2
         )
         self.hidden = torch.ones_like(self.weight)
 
@@ -136,7 +136,7 @@ class _Placement:
 
         def ranked(cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
             for camera in cameras:
-                scored.append((_score(self.few, self.growth, camera, self.reach), camera))
+                scored.append((_score(self.sample, self.growth, camera, self.reach), camera))
                 tell(self.progress, Phase.CAMERAS, start + len(scored), start + 2 * tries)
             return sorted(
                 (candidate for candidate in scored if candidate[0] > -math.inf),
@@ -158,10 +158,10 @@ class _Placement:
         """Cameras towards rows, preferably small opaque ones, from uniform directions, at half to
         twice the reach.
         """
-        means = self.few.means
+        means = self.sample.means
         random = partial(torch.rand, generator=self.generator)
         # torch.multinomial has a limit of 2^24 weights.
-        interest = self.weight * self.hidden / self.few.scales.amax(1).clamp(min=1e-12)
+        interest = self.weight * self.hidden / self.sample.scales.amax(1).clamp(min=1e-12)
         ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
         rows = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
         targets = means[rows.clamp(max=len(means) - 1).to(means.device)].cpu()
@@ -193,12 +193,12 @@ class _Placement:
             gap = gap.minimum((places - places[chosen[-1]]).norm(dim=1))
         return [cameras[k] for k in chosen]
 
-    def shown_share(self, cameras: Sequence[Camera]) -> float:
+    def covered_share(self, cameras: Sequence[Camera]) -> float:
         """The share of the Gaussians, by opacity, that these cameras and those before show: COVERED
         pixels or more.
         """
         for camera in cameras:
-            pixels = coverage(self.few, self.few.opacities, camera, self.growth)
+            pixels = coverage(self.sample, self.sample.opacities, camera, self.growth)
             self.hidden *= pixels * (WIDTH / camera.width) ** 2 < COVERED
         return 1 - float((self.weight * self.hidden).sum() / self.weight.sum())
 

@@ -147,7 +147,7 @@ def add_pseudo_views(
     if not 0 < len(photographs) < MANY:
         return scene
     nearby = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
-    few = f"only {len(photographs)} photographs to train on"
+    shortage = f"only {len(photographs)} photographs to train on"
     try:
         placed = place_cameras(
             gaussians,
@@ -157,12 +157,14 @@ def add_pseudo_views(
             progress=progress,
         )
     except ClodError as error:
-        note = f"{few} may be too few, and no pseudo views can be added: {error}"
+        note = f"{shortage} may be too few, and no pseudo views can be added: {error}"
         return replace(scene, notes=(*scene.notes, note))
     teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
     near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
     pseudo_views = (*nearby * near, *_views(teacher, placed))
-    note = f"{few}: {len(pseudo_views)} pseudo views, the checkpoint's own renderings, are added"
+    note = (
+        f"{shortage}: {len(pseudo_views)} pseudo views, the checkpoint's own renderings, are added"
+    )
     return replace(scene, train=(*photographs, *pseudo_views), notes=(*scene.notes, note))
 
 
