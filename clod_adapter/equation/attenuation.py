@@ -120,12 +120,8 @@ def attenuate(
         a = opacities if activated else opacities.sigmoid()
         return Attenuated(a, torch.ones_like(a, dtype=torch.bool), torch.ones_like(a))
     d = normalized_distances(*seen_from, config) if isinstance(seen_from, tuple) else seen_from
-    tensors = {
-        "opacities" if activated else "opacity_logits": opacities,
-        "sigma_d": sigma_d,
-        "d": d,
-    }
-    opacities, sigma, d = conform(**tensors)
+    name = "opacities" if activated else "opacity_logits"
+    opacities, sigma, d = conform(**{name: opacities}, sigma_d=sigma_d, d=d)
     if growth_d is None:
         growth = torch.ones_like(d)
     else:

@@ -213,11 +213,9 @@ def read(path: Path, data: bytes) -> Source:
     if others:
         notes.append(f"{len(others)} more primitives with Gaussians in it are left out")
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
-    arrays["shN"] = (
-        np.stack(coefficients, 1)
-        if coefficients
-        else np.zeros((len(arrays["means"]), 0, 3), np.float32)
-    )
+    arrays["shN"] = np.zeros((len(arrays["means"]), 0, 3), np.float32)
+    if coefficients:
+        arrays["shN"] = np.stack(coefficients, 1)
     stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
     stored = stored if turned else half_turn(stored, "z")
