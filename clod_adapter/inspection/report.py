@@ -102,28 +102,23 @@ def inspect(path: str | Path) -> Inspection:
         )
         order = "little" if head.ply.byte_order in "<=" else "big"
         encoding = "ascii" if head.ply.text else f"binary {order}-endian"
+    extra: tuple[str, ...] = ()
+    if not head or not is_packed(head.ply):
+        extra = extra_columns([name for name, _ in columns], degree)
     splat = Splat(
         **values,
         sh_degree=degree,
         encoding=encoding,
         columns=columns,
-        extra=(
-            ()
-            if head and is_packed(head.ply)
-            else extra_columns([name for name, _ in columns], degree)
-        ),
+        extra=extra,
         comments=tuple(comment for comment in source.comments if not comment.startswith(PREFIX)),
         origin=rows.origin,
         dial=dial,
         screen_filter=stated_filter(source),
     )
-    writer = (
-        looks_like(head)
-        if head
-        else f"clod-adapter {metadata.version}"
-        if metadata.version
-        else None
-    )
+    writer = f"clod-adapter {metadata.version}" if metadata.version else None
+    if head:
+        writer = looks_like(head)
     if writer == NERFSTUDIO:
         notes.append(
             "in nerfstudio's own frame: its dataparser_transforms.json belongs in the scene's"

@@ -90,12 +90,10 @@ class Checkpoint:
             return []
         size = self.calibration.width, self.calibration.height
         looking = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
-        return with_near_planes(
-            [
-                camera_of(viewpoint, *size, f"viewpoint {number}")
-                for number, viewpoint in enumerate(looking, start=1)
-            ]
-        )
+        cameras = []
+        for number, viewpoint in enumerate(looking, start=1):
+            cameras.append(camera_of(viewpoint, *size, f"viewpoint {number}"))
+        return with_near_planes(cameras)
 
     @property
     def placed(self) -> bool:

@@ -75,60 +75,54 @@ def write_page(
     series = charts.series_of(report)
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
     drawn = [line for line in series if not (against_base and line.label == charts.BASE)]
-    draws: dict[str, charts.Draw] = {
-        name: partial(charts.draw_rows, series=drawn, quantity=name)
-        for name in (charts.QUANTITIES if drawn else ())
-    }
+    draws: dict[str, charts.Draw] = {}
+    for name in charts.QUANTITIES if drawn else ():
+        draws[name] = partial(charts.draw_rows, series=drawn, quantity=name)
     if training:
+        curves = training["curves"]
         base_psnr = None if against_base else training["base_psnr"]
-        draws["adapting"] = partial(
-            charts.draw_training, curves=training["curves"], base_psnr=base_psnr
-        )
-    dial = (
-        sorted(drawn[0].rows, key=lambda row: row["virtual_scale"])
-        if drawn and drawn[0].dial
-        else []
-    )
+        draws["adapting"] = partial(charts.draw_training, curves=curves, base_psnr=base_psnr)
     tiles = [(line.label, line.rows[0]) for line in drawn if line.label == charts.BASE]
-    ends_and_middle = dict.fromkeys((0, len(dial) // 2, len(dial) - 1)) if dial else ()
-    tiles += [(f"s = {dial[k]['virtual_scale']:g}", dial[k]) for k in ends_and_middle]
+    if drawn and drawn[0].dial:
+        rows = sorted(drawn[0].rows, key=lambda row: row["virtual_scale"])
+        for k in dict.fromkeys((0, len(rows) // 2, len(rows) - 1)):  # the ends and the middle
+            tiles.append((f"s = {rows[k]['virtual_scale']:g}", rows[k]))
     settings = {
         "model": report["model"],
         "scene": "none (synthetic views)" if against_base else report["scene"],
+        "version": report["version"],
+        **report["machine"],
+        "device": report["device"],
     }
-    settings |= {"version": report["version"], **report["machine"], "device": report["device"]}
     settings |= {f"{name}, seconds": f"{value:.1f}" for name, value in report["seconds"].items()}
     chosen_frames = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4))
     strip = [*others.values(), *(frames[k] for k in chosen_frames)] if frames else []
     source = files("clod_adapter.report")
     template = (source / "page.html").read_text("utf-8")
-    page = (
-        jinja2.Environment(autoescape=True)
-        .from_string(template)
-        .render(
-            report=report,
-            own=against_base,
-            name=PurePath(report.get("outputs", {}).get("ply", report["model"])).name,
-            model=PurePath(report["model"]).name,
-            scene="" if against_base else PurePath(abspath(report["scene"])).name,
-            series=series,
-            drawn=drawn,
-            tiles=tiles,
-            frames=frames,
-            others=others,
-            strip=strip,
-            training=training,
-            settings=settings,
-            charts={name: partial(charts.inline_svg, draw, name) for name, draw in draws.items()},
-            data=script_json({"report": report, "training": training}),
-            style=(source / "style.css").read_text("utf-8"),
-            script=(source / "dial.js").read_text("utf-8"),
-        )
+    page = jinja2.Environment(autoescape=True).from_string(template)
+    text = page.render(
+        report=report,
+        own=against_base,
+        name=PurePath(report.get("outputs", {}).get("ply", report["model"])).name,
+        model=PurePath(report["model"]).name,
+        scene="" if against_base else PurePath(abspath(report["scene"])).name,
+        series=series,
+        drawn=drawn,
+        tiles=tiles,
+        frames=frames,
+        others=others,
+        strip=strip,
+        training=training,
+        settings=settings,
+        charts={name: partial(charts.inline_svg, draw, name) for name, draw in draws.items()},
+        data=script_json({"report": report, "training": training}),
+        style=(source / "style.css").read_text("utf-8"),
+        script=(source / "dial.js").read_text("utf-8"),
     )
     outputs = {name: charts.chart_file(path, name) for name in draws}
     with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
         for png, draw in zip(pngs, draws.values(), strict=True):
             with charts.chart(draw, charts.SIZE) as figure:
                 charts.save_figure(figure, png)
-        temporary.write_text(as_text(page), encoding="utf-8")
+        temporary.write_text(as_text(text), encoding="utf-8")
     return {"page": path, **outputs}

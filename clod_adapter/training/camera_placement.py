@@ -98,7 +98,8 @@ def place_cameras(
         except ClodError:  # what is left cannot be shown
             break
     for k, camera in enumerate(cameras):
-        K = _intrinsics(float(camera.K[0, 0]) / camera.width, WIDTH, HEIGHT)
+        zoom = float(camera.K[0, 0]) / camera.width
+        K = _intrinsics(zoom, WIDTH, HEIGHT)
         cameras[k] = replace(camera, K=K, width=WIDTH, height=HEIGHT, name=f"placed_{k:03}")
     return cameras
 
@@ -123,9 +124,9 @@ class _Placement:
         self.progress = progress
         self.judged = 0  # candidates so far
         # Each row stands for growth^2 of the checkpoint's.
-        self.weight = (
-            self.sample.opacities if self.growth is None else self.sample.opacities * self.growth**2
-        )
+        self.weight = self.sample.opacities
+        if self.growth is not None:
+            self.weight = self.weight * self.growth**2
         self.hidden = torch.ones_like(self.weight)
 
     def round(self, views: int) -> list[Camera]:
@@ -136,12 +137,11 @@ class _Placement:
 
         def ranked(cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
             for camera in cameras:
-                scored.append((_score(self.sample, self.growth, camera, self.reach), camera))
+                score = _score(self.sample, self.growth, camera, self.reach)
+                scored.append((score, camera))
                 tell(self.progress, Phase.CAMERAS, start + len(scored), start + 2 * tries)
-            return sorted(
-                (candidate for candidate in scored if candidate[0] > -math.inf),
-                key=lambda candidate: -candidate[0],
-            )
+            usable = [candidate for candidate in scored if candidate[0] > -math.inf]
+            return sorted(usable, key=lambda candidate: -candidate[0])
 
         good = ranked(self._towards(tries))[: max(round(BEST * tries), 1)]
         if not good:
@@ -165,10 +165,10 @@ class _Placement:
         ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
         rows = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
         targets = means[rows.clamp(max=len(means) - 1).to(means.device)].cpu()
-        sides = F.normalize(
-            torch.randn(count, 3, generator=self.generator, dtype=torch.float32), dim=1
-        )
-        away = self.reach * 2 ** (2 * random(count, 1, dtype=torch.float32) - 1)
+        sides = torch.randn(count, 3, generator=self.generator, dtype=torch.float32)
+        sides = F.normalize(sides, dim=1)
+        octaves = 2 * random(count, 1, dtype=torch.float32) - 1
+        away = self.reach * 2**octaves
         for eye, target in zip(targets + away * sides, targets, strict=True):
             yield _looking(eye, target, self.zoom)
 
@@ -177,15 +177,17 @@ class _Placement:
         steps = STEP * torch.randn(count, 2, 3, generator=self.generator, dtype=torch.float32)
         for camera, (turn, step) in zip(itertools.cycle(cameras), steps, strict=False):
             eye = camera.position + self.reach * step
-            yield _looking(eye, eye + self.reach * (camera.viewmat[2, :3] + turn), self.zoom)
+            forward = camera.viewmat[2, :3] + turn
+            yield _looking(eye, eye + self.reach * forward, self.zoom)
 
     def _spread(self, cameras: list[Camera], count: int) -> list[Camera]:
         """``count`` of the cameras by farthest-point sampling of position and direction, from the
         first one.
         """
-        places = torch.stack(
-            [torch.cat([c.position / self.reach, c.viewmat[2, :3]]) for c in cameras]
-        )
+        points = []
+        for camera in cameras:
+            points.append(torch.cat([camera.position / self.reach, camera.viewmat[2, :3]]))
+        places = torch.stack(points)
         chosen = [0]
         gap = (places - places[0]).norm(dim=1)
         while len(chosen) < min(count, len(cameras)):
@@ -207,7 +209,8 @@ def _usable(gaussians: Gaussians) -> Tensor:
     """``[n]`` int64, the visible and finite Gaussians. An infinite opacity logit is a fully opaque
     Gaussian.
     """
-    others = {n: v for n, v in gaussians.tensors().items() if n != "opacity_logits"}
+    others = gaussians.tensors()
+    del others["opacity_logits"]
     rows = (gaussians.opacities > VISIBLE) & ~nonfinite_rows(others)
     if not rows.any():
         raise ClodError(
@@ -219,9 +222,8 @@ def _usable(gaussians: Gaussians) -> Tensor:
 def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
     """A camera for scoring. The up direction is unknown; COLMAP's y axis usually points down."""
     forward = F.normalize(target - eye, dim=0)
-    down = torch.tensor(
-        [0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.99 else [0.0, 0.0, 1.0], dtype=torch.float32
-    )
+    axis = [0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.99 else [0.0, 0.0, 1.0]
+    down = torch.tensor(axis, dtype=torch.float32)
     near = near_plane(float((target - eye).norm()))
     return Camera(looking(eye, forward, down), _intrinsics(zoom, *LOOK), *LOOK, near=near)
 
@@ -252,13 +254,11 @@ def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, T
     share = size * (SAMPLE / size.sum())
     for _ in range(ROUNDS):
         share = (share * (SAMPLE / share.sum())).clamp_(max=1)
-    random = torch.rand(
-        len(rows), generator=torch.Generator().manual_seed(seed), dtype=torch.float64
-    )
+    generator = torch.Generator().manual_seed(seed)
+    random = torch.rand(len(rows), generator=generator, dtype=torch.float64)
     selected = random.to(share.device) < share
-    return gaussians.select(rows[selected]).without_empty_bands(), share[selected].rsqrt().to(
-        gaussians.means
-    )
+    growth = share[selected].rsqrt().to(gaussians.means)
+    return gaussians.select(rows[selected]).without_empty_bands(), growth
 
 
 def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera, reach: float) -> float:
