@@ -37,8 +37,8 @@ def rejected_if_damaged(
     except Exception as error:  # of libraries, and whatever a crafted file provokes
         if isinstance(error, ClodError) and str(error).startswith(str(ClodError(f"{path}: "))):
             raise
-        # Of what a file contains libraries raise it without a number, or with that of a seek to
-        # nowhere.
+        # Libraries raise an OSError without a number, or with that of a seek to nowhere, for what a
+        # file contains.
         if isinstance(error, OSError) and error.errno not in (None, EINVAL):
             raise ClodError(
                 f"{path}: cannot be read ({error.strerror}); check the path and its permissions"

@@ -86,7 +86,7 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     """``(1 - w) mean |image - target| + w (1 - SSIM)``, w = ssim_weight (3DGS; CLoD-GS's L_render
     has 0.2).
 
-    Of a float render ``[H, W, 3]`` that is not clamped, and a uint8 photograph.
+    Takes a float render ``[H, W, 3]`` that is not clamped, and a uint8 photograph.
     """
     if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FusedLoss.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]

@@ -19,8 +19,8 @@ if TYPE_CHECKING:  # the command reports an interrupt without importing torch
     from clod_adapter.gaussians import Gaussians
 
 PRESSED = (signal.SIGINT, signal.SIGTERM)
-# Of a closed terminal, and of schedulers before a job's time is over; the same one may arrive
-# several times. Not all platforms have them.
+# Signals of a closed terminal, and of schedulers before a job's time is over; the same one may
+# arrive several times. Not all platforms have them.
 WARNINGS = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
 ENDING = (*PRESSED, *(getattr(signal, name) for name in WARNINGS if hasattr(signal, name)))
 

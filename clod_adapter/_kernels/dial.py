@@ -182,7 +182,7 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
         dL/dlogscale = dL/dscale scale
         dL/dgrowth   = sum of dL/dlogscale, times log m         0 where the growth is clamped
 
-    Of activated ones, that of the opacity alone.
+    Activated opacities have no other gradient than their own.
     """
     dial = drawing.dial
     opacity = gather(stored.opacities, rows)

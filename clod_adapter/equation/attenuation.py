@@ -64,8 +64,8 @@ from clod_adapter.gaussians import Gaussians
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d: f is exactly 1 for d s < 1e7 in float32, d s < 8e4 in float64."""
 
-# Of trained exponents. 3/4 preserves area where counts fall as s^-1.5; above 1 a Gaussian far away
-# grows on the screen.
+# Range of trained exponents. 3/4 preserves area where counts fall as s^-1.5; above 1 a Gaussian far
+# away grows on the screen.
 GROWTH_RANGE = (-1.0, 3.0)
 LOG_GROWTH_MAX = 20.0  # of abs(log g)
 TAKEOVER = 5.0  # far Gaussians begin at sqrt(1 - 1/5) H

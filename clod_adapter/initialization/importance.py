@@ -67,7 +67,7 @@ def initialize(
 def importance(
     base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None
 ) -> Tensor:
-    """``[N]`` what each Gaussian matters to the pictures: the root of its ``removal_error``, times
+    """``[N]`` the weight of each Gaussian in the pictures: the root of its ``removal_error``, times
     its opacity.
     """
     return removal_error(base, views, seed=config.seed, progress=progress).sqrt() * base.opacities

@@ -266,7 +266,8 @@ def rasterization_2dgs_inria_wrapper(
 ) -> tuple[tuple[Tensor, Tensor], Meta]:
     """``gsplat.rasterization_2dgs_inria_wrapper`` with a dial; see ``rasterization``.
 
-    Of several cameras gsplat returns the alphas and the maps of the last one; here they are of all.
+    For several cameras gsplat returns the alphas and the maps of the last one; here they are of
+    all.
     ``means2d`` of ``meta`` is ``[N, 3]`` for one camera and ``[C, N, 3]`` for several.
     """
     raise NotImplementedError

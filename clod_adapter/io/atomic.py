@@ -67,7 +67,7 @@ def remove_leftovers(final: Path) -> None:
 def output_lock(final: Path, *, of: Path | None = None) -> Iterator[None]:
     """Holds, in the body, the lock of ``final``, by a hidden file beside it; errors name ``of``.
 
-    Of two runs the second would remove the temporaries of the first. The lock ends with the
+    A second run would remove the temporaries of the first. The lock ends with the
     process, however that ends. On a file system without locks nothing is locked.
     """
     from filelock import FileLock, Timeout  # here: --help needs no lock

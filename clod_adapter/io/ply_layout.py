@@ -47,7 +47,7 @@ EXTENT = "calibrated_with"
 ROW = "calibrated"
 VIEWPOINT = "viewpoint"
 DIAL = "attenuation"
-# Of the columns of settings: group, field, and what a column of 1 stands for where the setting is
+# Columns of settings: group, field, and what a column of 1 stands for where the setting is
 # no number.
 _SETTINGS: dict[str, tuple[str, str, Any]] = {
     "reference_distance": (DIAL, "reference_distance", None),

@@ -31,7 +31,7 @@ WARNING = "warning: "  # prefix of a note that must not be missed
 FILTER = "screen_filter"
 MODEL = "clod-model"
 ADAPTER = "clod-adapter"
-# Of the kinds of documents: the version of the format, and the message for another kind.
+# Kinds of documents: the version of the format, and the message for another kind.
 KINDS = {
     MODEL: (1, "is not a model but {}; clod-adapt apply makes one of an adapter"),
     ADAPTER: (

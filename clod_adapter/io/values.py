@@ -299,14 +299,15 @@ def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarr
     odd number of the axes that flip.
     """
     x, y, z = (np.float32(1 if name == axis else -1) for name in "xyz")
-    # Of degree and order: odd in y for a negative order, in x for an odd one (else an even one), in
-    # z where they differ by an odd number.
+    # A harmonic is odd in y for a negative order, in x for an odd one (else an even one), in z
+    # where degree and order differ by an odd number.
     harmonics = []
     for degree in range(1, 5):
-        for m in range(-degree, degree + 1):
-            odd_in_x = (abs(m) - (m < 0)) % 2
-            odd_in_z = (degree - m) % 2
-            harmonics.append(x**odd_in_x * y ** int(m < 0) * z**odd_in_z)
+        for order in range(-degree, degree + 1):
+            odd_in_y = int(order < 0)
+            odd_in_x = (abs(order) - odd_in_y) % 2
+            odd_in_z = (degree - order) % 2
+            harmonics.append(x**odd_in_x * y**odd_in_y * z**odd_in_z)
     bands = arrays["shN"].shape[1]
     return {
         **arrays,

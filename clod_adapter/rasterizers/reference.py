@@ -72,7 +72,7 @@ def project(
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """``[n, 3, 3]`` of quaternions wxyz of any length above 0."""
+    """``[n, 3, 3]`` the matrices of quaternions wxyz of any length above 0."""
     unit_quats = quats / quats.norm(dim=1, keepdim=True)
     w, *axis = unit_quats.unbind(1)
     x, y, z = axis

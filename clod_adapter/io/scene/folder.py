@@ -175,7 +175,8 @@ def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str,
     """The parts of a photograph's name, split at / and at the \\ of files made on Windows; rejects
     what is no name.
 
-    Of a path that leads out of ``home``, the longest end that is a file there, with one of ENDINGS.
+    Where the path leads out of ``home`` it is the longest end that is a file there, with one of
+    ENDINGS.
     """
     if as_text(name) != name:
         raise ClodError(

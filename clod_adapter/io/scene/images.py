@@ -25,8 +25,8 @@ from clod_adapter.io.scene.colmap import HUGE, PosedImage
 
 # a change to a photograph, with {} for what differs between photographs, and that
 Note = tuple[str, str]
-# Of a pinhole camera: 8-bit RGB at the size that is used, ``[3, 3]`` the intrinsics, and the
-# changes.
+# A pinhole camera's photograph: 8-bit RGB at the size that is used, ``[3, 3]`` the intrinsics, and
+# the changes.
 Photograph = tuple[Image.Image, np.ndarray, list[Note]]
 
 # Pillow opens files by content, and starts another program for some (PostScript). JPEG includes the
