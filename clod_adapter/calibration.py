@@ -14,8 +14,9 @@ from clod_adapter.config import FARTHEST, require
 from clod_adapter.errors import ClodError
 
 AGAINST = ("photographs", "checkpoint")
-# rows and viewpoints, and characters of the machine's name, for which every file has room
-MOST = 1000
+# Every file has room for so many.
+MOST_ENTRIES = 1000  # rows and viewpoints
+LONGEST_MACHINE = 1000  # characters of the machine's name
 NARROWEST = 1e-4  # angle of view, radians
 LARGEST = 1 << 32  # count
 PIXELS = 1 << 26  # of an image: a page renders images of this size
@@ -136,7 +137,8 @@ class Calibration:
             f"at most {PIXELS} pixels",
         )
         entries = len(self.rows) + len(self.viewpoints)
-        require(entries <= MOST, "the number of rows and viewpoints", entries, f"at most {MOST}")
+        limit = f"at most {MOST_ENTRIES}"
+        require(entries <= MOST_ENTRIES, "the number of rows and viewpoints", entries, limit)
         plain = self.machine.isascii() and self.machine == _plain(self.machine) != ""
         require(
             plain, "the machine of a calibration", repr(self.machine), "one line of printable ASCII"
@@ -204,4 +206,4 @@ def _floats(row: dict[str, Any]) -> dict[str, float]:
 
 def _plain(text: str) -> str:
     printable = "".join(letter if letter.isprintable() else " " for letter in text)
-    return " ".join(printable.split())[:MOST].strip()
+    return " ".join(printable.split())[:LONGEST_MACHINE].strip()

@@ -27,22 +27,22 @@ from statistics import median
 FRAMES = 20  # at most so many frames enter the law
 NEWEST = 3  # frames: one outlier has no influence on their median
 EXPONENT = 0.75  # of the prediction
-NEAR = 0.15  # in log s: frames that count as frames of the present dial value
+SAME_DIAL = 0.15  # in log s: frames that count as frames of the present dial value
 DEAD_BAND = 0.03  # in log t: smaller excesses leave the dial where it is
 OUTLIER = 3.0  # median deviations of a changed load
 STEP = math.log(1.1)  # largest change of log s per frame
 
-Frame = tuple[float, float]
+TimedFrame = tuple[float, float]
 
 
-def excess(frames: Sequence[Frame], milliseconds: float) -> float:
+def excess(frames: Sequence[TimedFrame], milliseconds: float) -> float:
     """e of dial values and milliseconds, oldest first, at least one; positive if frames take longer
     than allowed.
     """
     predicted = []
     for age, (dial, took) in enumerate(reversed(frames[-FRAMES:])):
         distance = math.log(dial / frames[-1][0])
-        if age >= NEWEST and abs(distance) > NEAR:
+        if age >= NEWEST and abs(distance) > SAME_DIAL:
             break
         predicted.append(math.log(max(took / milliseconds, 1e-3)) + EXPONENT * distance)
     present = median(predicted)
@@ -51,7 +51,7 @@ def excess(frames: Sequence[Frame], milliseconds: float) -> float:
     return newest if abs(newest - present) > max(DEAD_BAND, OUTLIER * noise) else present
 
 
-def next_dial(frames: Sequence[Frame], milliseconds: float, max_sv: float) -> float:
+def next_dial(frames: Sequence[TimedFrame], milliseconds: float, max_sv: float) -> float:
     """The dial value of the next frame, in [1, max_sv]; that of the newest frame until there are
     3.
     """

@@ -24,7 +24,7 @@ from clod_adapter.cameras import NEAR, Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial, warn_of_no_dial
 from clod_adapter.errors import ClodError
-from clod_adapter.frame_rate import DEAD_BAND, FRAMES, NEWEST, Frame, excess, next_dial
+from clod_adapter.frame_rate import DEAD_BAND, FRAMES, NEWEST, TimedFrame, excess, next_dial
 
 Array = TypeVar("Array", Tensor, np.ndarray[Any, Any])
 
@@ -173,7 +173,7 @@ class Hold:
 
     hook: Hook
     milliseconds: float
-    _frames: list[Frame] = field(default_factory=list, init=False, repr=False)
+    _frames: list[TimedFrame] = field(default_factory=list, init=False, repr=False)
 
     def __post_init__(self) -> None:
         require(

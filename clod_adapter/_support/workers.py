@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from typing import Any, TypeVar
 
-MOST = 256  # threads; they are started as they are needed
+MOST_THREADS = 256  # threads; they are started as they are needed
 
 Result = TypeVar("Result")
 
@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 @cache
 def shared() -> ThreadPoolExecutor:
     """The threads that all kernels share; none of their calls waits for another."""
-    return ThreadPoolExecutor(MOST)
+    return ThreadPoolExecutor(MOST_THREADS)
 
 
 if hasattr(os, "register_at_fork"):

@@ -36,7 +36,7 @@ CLEAR = 3.0  # dB by which another explanation must be better
 DOUBTFUL = 6.0
 # A wrong filter measured at least 0.48 dB worse than that of training.
 CLEAR_FILTER = 0.2  # dB, mean over the views
-MOST = 0.75  # share of the views in which the chosen filter must be better
+AGREEING = 0.75  # share of the views in which the chosen filter must be better
 
 
 @dataclass(frozen=True)
@@ -150,8 +150,8 @@ def compare_filters(
 
     Most files do not name theirs. With another filter than that of training, Gaussians of about a
     pixel render too opaque or too faint. Another than ``expected`` is chosen if its mean PSNR over
-    MOST_VIEWS of the views is CLEAR_FILTER dB higher, its PSNR is higher in MOST of them and its
-    pooled error is DOUBTFUL dB below that of the photographs' mean colours (in a wrong frame,
+    MOST_VIEWS of the views is CLEAR_FILTER dB higher, its PSNR is higher in AGREEING of them and
+    its pooled error is DOUBTFUL dB below that of the photographs' mean colours (in a wrong frame,
     fainter is closer).
     """
     views = spread(views, MOST_VIEWS)
@@ -172,7 +172,7 @@ def compare_filters(
     gained = psnr - psnr[names.index(expected)]
     means = psnr.mean(1)
     clear = gained.mean(1) > CLEAR_FILTER
-    clear &= (gained > 0).float().mean(1) >= MOST
+    clear &= (gained > 0).float().mean(1) >= AGREEING
     clear &= error.mean(1) < constant * 10 ** (-DOUBTFUL / 10)
     best = expected
     if bool(clear.any()):

@@ -27,7 +27,7 @@ from clod_adapter.gaussians import Gaussians
 COARSE = (72, 20_000)  # of the small renders: pixels of width, Gaussians
 # For the found place: the same, and the first and the last step as shares of the cameras' distance.
 FINER = ((240, 20_000, (0.01, 0.001)), (480, 60_000, (0.001, 0.0001)))
-VIEWS = 4  # number of small renders
+SMALL_RENDERS = 4  # number of small renders
 SCALES = [10 ** (k / 12) for k in range(-24, 25)]  # a hundredth to a hundred, in steps of 21 %
 LOWEST_CORRELATION = 0.5  # after the coarse search; below it the search ends
 ROUNDS = 20  # of the point that most cameras look at
@@ -102,7 +102,7 @@ def _small(
     """The correlation of small photographs with renders, in a frame, of the ``most`` Gaussians that
     cover most.
     """
-    shrunk = [_shrunk(view, width) for view in spread(views, VIEWS)]
+    shrunk = [_shrunk(view, width) for view in spread(views, SMALL_RENDERS)]
     if len(gaussians) > most:
         log_areas = gaussians.log_scales.topk(2, dim=1).values.sum(1)
         cover = F.logsigmoid(gaussians.opacity_logits) + log_areas

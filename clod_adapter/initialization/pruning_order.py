@@ -24,7 +24,7 @@ DIFFERENT = 1e12  # dissimilarity for colours or sizes that are not finite
 STUCK = 0.02
 BLOCK = 1 << 13  # rows that are compared at a time: three times as fast as it fits in cache
 DIALS = 24  # dial values of the fit of growth, evenly spaced in log s
-MOST = 1.0  # of its exponents before SHARE
+LARGEST_EXPONENT = 1.0  # of the fit, before SHARE
 SHARE = 0.65  # of the fitted exponents that is used; 0.5 and 0.8 are no better at any share
 
 
@@ -141,7 +141,8 @@ def _most_similar(
 
 @torch.no_grad()
 def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor) -> Tensor:
-    """``[N]`` the exponents h, in [0, MOST SHARE], from the pruning order; no photograph is needed.
+    """``[N]`` the exponents h, in [0, LARGEST_EXPONENT SHARE], from the pruning order; no
+    photograph is needed.
 
     At a dial value s a Gaussian stands for itself and for all that were removed before s in whose
     favour it, or their substitute, was kept. Areas A are opacity times the product of the two
@@ -167,7 +168,7 @@ def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor)
         available = growth_factors(unit_growth, distances, s, start).double().log()
         total += kept * needed * available
         weight += kept * available.square()
-    exponents = (total / weight.clamp(min=1e-12)).clamp_(0, MOST)
+    exponents = (total / weight.clamp(min=1e-12)).clamp_(0, LARGEST_EXPONENT)
     return exponents.mul_(SHARE).to(gaussians.opacity_logits)
 
 

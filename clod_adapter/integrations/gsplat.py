@@ -44,7 +44,7 @@ __all__ = [
 
 RenderMode = Literal["RGB", "d", "Ed", "D", "ED", "RGB-d", "RGB-Ed", "RGB+D", "RGB+ED"]
 CameraModel = Literal["pinhole", "ortho", "fisheye", "ftheta", "lidar"]
-DIAL = {"sigma_d": None, "virtual_scale": 1.0, "attenuation": None, "growth_d": None}
+DIAL_ARGUMENTS = {"sigma_d": None, "virtual_scale": 1.0, "attenuation": None, "growth_d": None}
 Meta = dict[str, Any]
 Typed = TypeVar("Typed", bound=Callable[..., Any])
 
@@ -61,7 +61,7 @@ def _of_gsplat(typed: Typed) -> Typed:
     @functools.wraps(typed)
     def attenuated(*args: Any, **kwargs: Any) -> Any:
         function = getattr(gsplat, name)
-        dial = {key: kwargs.pop(key, default) for key, default in DIAL.items()}
+        dial = {key: kwargs.pop(key, default) for key, default in DIAL_ARGUMENTS.items()}
         settings = dropped_in(**dial)
         if settings is None:
             return function(*args, **kwargs)

@@ -46,19 +46,19 @@ MACHINE = "calibrated_on"
 EXTENT = "calibrated_with"
 ROW = "calibrated"
 VIEWPOINT = "viewpoint"
-DIAL = "attenuation"
+DIAL_GROUP = "attenuation"
 # Columns of settings: group, field, and what a column of 1 stands for where the setting is
 # no number.
 _SETTINGS: dict[str, tuple[str, str, Any]] = {
-    "reference_distance": (DIAL, "reference_distance", None),
-    "near_distance": (DIAL, "near_distance", None),
-    "paper": (DIAL, "form", "paper"),
+    "reference_distance": (DIAL_GROUP, "reference_distance", None),
+    "near_distance": (DIAL_GROUP, "near_distance", None),
+    "paper": (DIAL_GROUP, "form", "paper"),
     "screen_variance": (FILTER, "variance", None),
     "compensate": (FILTER, "compensate", True),
 }
 # the columns of ``settings.EARLIER``
 _EARLIER = {"clod_tau", "clod_eps", "clod_hard_cut", "clod_max", "clod_quantile"}
-_USUAL = {DIAL: asdict(AttenuationConfig()), FILTER: asdict(CLASSIC)}
+_USUAL = {DIAL_GROUP: asdict(AttenuationConfig()), FILTER: asdict(CLASSIC)}
 _INSTEAD = {SIGMA: "use a large number for no end", GROWTH: "use 0 for no growth"}
 
 
@@ -109,14 +109,14 @@ def ply_metadata(
     path: Path, comments: tuple[str, ...], rows: np.ndarray | None = None, *, dial: bool
 ) -> Metadata:
     """The settings of the comments, completed by those of the columns of ``rows``."""
-    columns = _constant_settings(path, rows) if dial and rows is not None else {DIAL: {}}
+    columns = _constant_settings(path, rows) if dial and rows is not None else {DIAL_GROUP: {}}
     ours = any(comment.startswith(PREFIX) for comment in comments)
     values = columns | _stored_settings(comments)
-    values[DIAL] = columns[DIAL] | values[DIAL]
+    values[DIAL_GROUP] = columns[DIAL_GROUP] | values[DIAL_GROUP]
     metadata = read_metadata(path, values, dial=dial, described=ours)
-    if ours or not columns[DIAL]:
+    if ours or not columns[DIAL_GROUP]:
         return metadata
-    note = f"settings of the dial read from columns: {', '.join(columns[DIAL])}"
+    note = f"settings of the dial read from columns: {', '.join(columns[DIAL_GROUP])}"
     return replace(metadata, notes=(note, *metadata.notes))
 
 
@@ -131,7 +131,7 @@ def write_comments(metadata: Metadata) -> list[str]:
     screen_filter = metadata.screen_filter or CLASSIC
     lines = [f"version {metadata.version or package_version()}"]
     if metadata.attenuation is not None:
-        for name, usual in _USUAL[DIAL].items():
+        for name, usual in _USUAL[DIAL_GROUP].items():
             lines.append(f"{name} {type(usual)(getattr(metadata.attenuation, name))}")
     if screen_filter != CLASSIC:
         lines.append(f"{FILTER} {screen_filter.variance} {screen_filter.compensate}")
@@ -167,7 +167,7 @@ def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
         measured["machine"] = settings.pop(MACHINE)
     if any(measured.values()):
         values["calibration"] = measured
-    return values | {"package_version": settings.pop("version", ""), DIAL: settings}
+    return values | {"package_version": settings.pop("version", ""), DIAL_GROUP: settings}
 
 
 def _by_field(kind: type, lines: Iterable[list[str]]) -> list[dict[str, str]]:
@@ -183,7 +183,7 @@ def constants_of(metadata: Metadata, *, growth: bool) -> dict[str, float]:
     if metadata.attenuation is None:  # a plain file has the columns of Inria's layout and no others
         return {}
     settings = {
-        DIAL: asdict(metadata.attenuation),
+        DIAL_GROUP: asdict(metadata.attenuation),
         FILTER: asdict(metadata.screen_filter or CLASSIC),
     }
     columns = {}
@@ -199,7 +199,7 @@ def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, Any]:
     """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of
     ``constants_of``.
     """
-    settings: dict[str, dict[str, Any]] = {DIAL: {}, FILTER: {}}
+    settings: dict[str, dict[str, Any]] = {DIAL_GROUP: {}, FILTER: {}}
     columns = (vertex.dtype.names or ()) if len(vertex) else ()
     if _EARLIER & {*columns}:
         raise ClodError(f"{path}: {EARLIER_FORM}")
@@ -217,7 +217,7 @@ def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, Any]:
                 settings[group][field] = word
     if settings[FILTER]:
         return settings | {FILTER: _USUAL[FILTER] | settings[FILTER]}
-    return {DIAL: settings[DIAL]}
+    return {DIAL_GROUP: settings[DIAL_GROUP]}
 
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:

@@ -68,7 +68,7 @@ def workers_for(rows: int) -> int:
     return threads.worker_count() if rows >= FEW else 1
 
 
-class Frame:
+class ForwardState:
     """State of the forward pass for the backward pass: projection, depth order and tile lists."""
 
     def __init__(
@@ -172,7 +172,7 @@ class _Picture(torch.autograd.Function):
     def forward(  # type: ignore[no-untyped-def]
         ctx: Any, camera, screen_filter, dial, trained, background, *inputs
     ):
-        frame = Frame(Stored(*_arrays(inputs)), camera, screen_filter, dial)
+        frame = ForwardState(Stored(*_arrays(inputs)), camera, screen_filter, dial)
         image, alpha = frame.blend(background.detach().contiguous().numpy())
         ctx.frame = frame
         ctx.trained = trained
@@ -183,7 +183,7 @@ class _Picture(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor):  # type: ignore[no-untyped-def, override]
         image, alpha, *inputs = ctx.saved_tensors
-        frame: Frame = ctx.frame
+        frame: ForwardState = ctx.frame
         need = Stored(*ctx.needs_input_grad[5:])
         # Unused sums are skipped. Above SH degree 0, a mean changes the colour too.
         shaped = need.means or need.quats or need.scales or need.growth

@@ -30,8 +30,8 @@ from clod_adapter.initialization.importance import coverage
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
-VIEWS = 96  # cameras of a round
-MOST = 384  # cameras of all rounds
+ROUND_CAMERAS = 96  # cameras of a round
+MOST_CAMERAS = 384  # cameras of all rounds
 SHOWN = 0.99  # share of the Gaussians to show
 COVERED = 0.5  # pixels with which a Gaussian is shown
 WIDTH = 496  # of the images; sizes in pixels refer to it
@@ -65,9 +65,9 @@ def place_cameras(
 
     Args:
         gaussians: a checkpoint; a dial it has is ignored.
-        views: number of cameras, at least 1; by default as many as the scene needs: rounds of VIEWS
-            cameras, each towards Gaussians that none has shown yet, until SHOWN of them are shown,
-            by opacity, or there are MOST.
+        views: number of cameras, at least 1; by default as many as the scene needs: rounds of
+            ROUND_CAMERAS cameras, each towards Gaussians that none has shown yet, until SHOWN of
+            them are shown, by opacity, or there are MOST_CAMERAS.
         seed: of the candidate cameras.
         field: horizontal field of view, degrees; ideally that of the original cameras.
         progress: called in ``Phase.CAMERAS`` after each candidate.
@@ -87,14 +87,14 @@ def place_cameras(
     """
     require(views is None or views >= 1, "views", views, "at least 1")
     placement = _Placement(detach(gaussians), seed, field, progress)
-    cameras = placement.round(views or VIEWS)
+    cameras = placement.round(views or ROUND_CAMERAS)
     while (
         views is None
-        and len(cameras) + VIEWS <= MOST
-        and placement.covered_share(cameras[-VIEWS:]) < SHOWN
+        and len(cameras) + ROUND_CAMERAS <= MOST_CAMERAS
+        and placement.covered_share(cameras[-ROUND_CAMERAS:]) < SHOWN
     ):
         try:
-            cameras += placement.round(VIEWS)
+            cameras += placement.round(ROUND_CAMERAS)
         except ClodError:  # what is left cannot be shown
             break
     for k, camera in enumerate(cameras):

@@ -24,7 +24,7 @@ from clod_adapter.training.plan import NOT_NEEDED, RATES, Decision, Override, Pl
 
 # dB: SH degrees are left out if the PSNR of the training views changes by less without them
 LIMIT = 0.02
-VIEWS = 8  # evenly spread training views on which that is measured
+MEASURED_VIEWS = 8  # evenly spread training views on which that is measured
 REQUESTED = "as requested, not measured"
 FEW = 0.02  # share of the Gaussians that the farthest views and the smallest budgets have
 FARTHER = 1.1  # step of the search for the dial value with that share
@@ -85,7 +85,7 @@ def _sh_degree(
 ) -> tuple[int, list[Decision]]:
     """The SH degree to train with."""
     highest = base.sh_degree
-    views = spread(views, VIEWS)
+    views = spread(views, MEASURED_VIEWS)
     if highest == 0:
         return 0, [Decision("SH degrees", NOT_NEEDED, None, "", "there are none")]
     if "bands" in override.keep:
@@ -114,7 +114,7 @@ def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> 
     if config.form == "paper" or config.max_sv == 1:
         return []
     assert initial.attenuation is not None
-    cameras = [view.camera for view in spread(views, VIEWS)]
+    cameras = [view.camera for view in spread(views, MEASURED_VIEWS)]
     distances = [
         normalized_distances(initial.means, camera, initial.attenuation) for camera in cameras
     ]

@@ -20,11 +20,11 @@ from clod_adapter.render import render
 from clod_adapter.training.camera_placement import SAMPLE, place_cameras
 
 # To fewer than MANY photographs ADDED pseudo views are added: up to half of them at the cameras of
-# the photographs, at most NEAR at each, from where they are moved WIDER; the others at placed
-# cameras.
+# the photographs, at most MOST_NEARBY at each, from where they are moved WIDER; the others at
+# placed cameras.
 MANY = 64
 ADDED = 96
-NEAR = 4
+MOST_NEARBY = 4
 WIDER = 2.0
 TEST_EVERY = 8  # as with photographs
 MOVED = 0.1  # standard deviation of a camera's random offset, of its distance to the scene
@@ -146,7 +146,7 @@ def add_pseudo_views(
     photographs = scene.train
     if not 0 < len(photographs) < MANY:
         return scene
-    nearby = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
+    nearby = max(min(MOST_NEARBY, ADDED // 2 // len(photographs)), 1)
     shortage = f"only {len(photographs)} photographs to train on"
     try:
         placed = place_cameras(

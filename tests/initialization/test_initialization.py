@@ -18,7 +18,7 @@ from clod_adapter.initialization.importance import initialize, removal_error, us
 from clod_adapter.initialization.pruning_order import (
     APART,
     COLOUR_FLOOR,
-    MOST,
+    LARGEST_EXPONENT,
     NEIGHBOURS,
     REMOVED,
     SHARE,
@@ -184,7 +184,11 @@ def test_exponents_are_in_range_and_0_without_descendants():
     growth = pruning.initial_growth(dialled, order.substitute, d)
     alone = torch.ones(400, dtype=torch.bool)
     alone[order.substitute[order.substitute != torch.arange(400)]] = False
-    assert growth.dtype == torch.float32 and growth.min() >= 0 and growth.max() <= MOST * SHARE
+    assert (
+        growth.dtype == torch.float32
+        and growth.min() >= 0
+        and growth.max() <= LARGEST_EXPONENT * SHARE
+    )
     assert not growth[alone].any() and (growth[~alone] > 0).sum() > 50
     views = photograph(model, ring(2, 16, 12))
     for iters in (0, 1):  # growth begins with 0 where it is trained

@@ -149,8 +149,8 @@ def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch):
     """A row of spheres needs more cameras than one sphere; nearly every disc is shown in the
     end.
     """
-    monkeypatch.setattr(camera_placement, "VIEWS", 8)
-    monkeypatch.setattr(camera_placement, "MOST", 40)
+    monkeypatch.setattr(camera_placement, "ROUND_CAMERAS", 8)
+    monkeypatch.setattr(camera_placement, "MOST_CAMERAS", 40)
     one = ball(200, torch.eye(3)[2]).select(torch.arange(200)).without_bands(0)
     street = {name: torch.cat([value] * 8) for name, value in one.tensors().items()}
     street["means"] = torch.cat([one.means + torch.tensor([8.0 * x, 0.0, 0.0]) for x in range(8)])

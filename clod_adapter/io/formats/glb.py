@@ -29,7 +29,7 @@ from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, dial_colum
 from clod_adapter.origin import NOWHERE, Origin, origin_of
 
 EXTENSION = "KHR_gaussian_splatting"
-DIAL = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D", OPACITY: "_OPACITY_D"}
+DIAL_ATTRIBUTES = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D", OPACITY: "_OPACITY_D"}
 COLOR_SPACE = "srgb_rec709_display"
 DEGREE = 3  # the highest that the extension has
 # about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
@@ -89,7 +89,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     }
     for k, name in enumerate(harmonics(degree)[1:]):
         columns[name] = np.ascontiguousarray(arrays["shN"][:, k])
-    columns |= {DIAL[name]: arrays[name] for name in dial_columns(arrays)}
+    columns |= {DIAL_ATTRIBUTES[name]: arrays[name] for name in dial_columns(arrays)}
     accessors: dict[str, dict[str, Any]] = {}
     views: list[dict[str, Any]] = []
     offset = 0
@@ -178,7 +178,7 @@ def has_dial(path: Path) -> bool:
     with rejected_if_damaged(path, *_DAMAGED):
         gltf, _ = _chunks(path, np.memmap(path, np.uint8, "r").data)
         (_, primitive), *_ = _find(path, gltf)
-        return DIAL[SIGMA] in primitive["attributes"]
+        return DIAL_ATTRIBUTES[SIGMA] in primitive["attributes"]
 
 
 def read(path: Path, data: bytes) -> Source:
@@ -193,8 +193,9 @@ def read(path: Path, data: bytes) -> Source:
         attributes = primitive["attributes"]
         degree = max(k for k in range(DEGREE + 1) if harmonics(k)[-1] in attributes)
         names = dict(_ATTRIBUTES)
-        for name in dial_columns([name for name in DIAL if DIAL[name] in attributes]):
-            names[name] = DIAL[name], 1
+        dial = [name for name, stored in DIAL_ATTRIBUTES.items() if stored in attributes]
+        for name in dial_columns(dial):
+            names[name] = DIAL_ATTRIBUTES[name], 1
         arrays = {
             key: _values(path, gltf, binary, attributes[name], width)
             for key, (name, width) in names.items()

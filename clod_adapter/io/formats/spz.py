@@ -61,7 +61,7 @@ AXES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 RDF = 6  # right, down, forward
 ANTIALIASED = 1  # flag of a filter that compensates opacities
 EXTENDED = 2  # flag of records after the arrays
-MOST = 10_000_000  # Gaussians that the reference reads
+MOST_GAUSSIANS = 10_000_000  # Gaussians that the reference reads
 DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
@@ -92,10 +92,11 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         distance = known_distance(config) or estimated_distance(gaussians.means)
         gaussians = with_distance(gaussians, distance) if distance > _FAR else gaussians
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))
-    if len(gaussians) > MOST or bits < 1:
+    if len(gaussians) > MOST_GAUSSIANS or bits < 1:
         actual = f"these are {len(gaussians):,} within {float(gaussians.means.abs().max()):.4g}"
         raise ClodError(
-            f"{path}: has room for {MOST:,} Gaussians within 4,000,000 of 0, {actual}; write a .ply"
+            f"{path}: has room for {MOST_GAUSSIANS:,} Gaussians within 4,000,000 of 0, {actual};"
+            " write a .ply"
         )
     degree = min(gaussians.sh_degree, DEGREE)
     flags = EXTENDED | (ANTIALIASED if gaussians.screen_filter.compensate else 0)
@@ -211,7 +212,7 @@ def read(path: Path, data: bytes) -> Source:
     magic, version, count = struct.unpack_from("<III", data)
     degree, bits, flags = data[12:15]
     readable = magic == MAGIC and version in (2, 3)
-    if not readable or degree not in SH_COUNTS or bits > 24 or count > MOST:
+    if not readable or degree not in SH_COUNTS or bits > 24 or count > MOST_GAUSSIANS:
         raise ClodError(
             f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians);"
             f" {_CONVERT}"
