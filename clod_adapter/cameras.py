@@ -112,6 +112,11 @@ def looking(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
     return viewmat
 
 
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
+    """``[3, 3]`` float32 K of focal lengths and principal point, pixels."""
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float32)
+
+
 def numbers_of(name: str, values: Any) -> Tensor:
     """``float_tensor`` of an argument; ClodError, with its name, where it is no array of
     numbers.

@@ -43,7 +43,8 @@ def origin_of(means: np.ndarray) -> Origin:
     if not 0 < FAR * spread < float(np.abs(middle).max()):
         return NOWHERE
     # The spread of doubles may be below the precision of the largest.
-    unit = 2.0 ** math.ceil(math.log2(max(spread, FINEST * float(np.abs(middle).max()))))
+    finest = FINEST * float(np.abs(middle).max())
+    unit = 2.0 ** math.ceil(math.log2(max(spread, finest)))
     x, y, z = (float(value) for value in np.round(middle / unit) * unit + 0.0)  # no -0
     return x, y, z
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.calibration import Viewpoint
-from clod_adapter.cameras import Camera
+from clod_adapter.cameras import Camera, intrinsics
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 
@@ -130,9 +130,7 @@ def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> 
     viewmat[:3, :3] = torch.stack([right, -up, look])
     viewmat[:3, 3] = -viewmat[:3, :3] @ centre
     focal = 0.5 * height / math.tan(0.5 * v.fov)
-    K = torch.tensor(
-        [[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]], dtype=torch.float32
-    )
+    K = intrinsics(focal, focal, 0.5 * width, 0.5 * height)
     return Camera(viewmat.float(), K, width, height, name)
 
 

@@ -185,7 +185,8 @@ def extinction_from_rank(rank: Tensor, config: AdaptConfig, total: int | None = 
     ``config.share`` are culled before s = 1.
     """
     share = (rank.double() + 0.5) / (total or len(rank))
-    power = (1 / share + (share**-2 - 4 * (1 / config.share - 1)).clamp(min=0).sqrt()) / 2
+    discriminant = share**-2 - 4 * (1 / config.share - 1)
+    power = (1 / share + discriminant.clamp(min=0).sqrt()) / 2
     return torch.where(
         share <= config.share, power ** (1 / config.exponent), config.share / share
     ).float()

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import NEAR
+from clod_adapter.cameras import NEAR, intrinsics
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.hook import Hook, dropped_in
@@ -83,14 +83,13 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         height = settings.image_height
         fx = width / (2 * settings.tanfovx)
         fy = height / (2 * settings.tanfovy)
-        K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float32)
+        K = intrinsics(fx, fy, width / 2, height / 2)
         opacities_drawn, keep, growth = hook(means3D, opacities, viewmat, K, width, height)
         # opposite to the viewing direction
         hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]
         means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
-        bound = inspect.signature(super().forward).bind(
-            means3D, means2D, opacities_drawn, *args, **kwargs
-        )
+        signature = inspect.signature(super().forward)
+        bound = signature.bind(means3D, means2D, opacities_drawn, *args, **kwargs)
         for name, power in () if growth_d is None else (("scales", 1), ("cov3D_precomp", 2)):
             if (value := bound.arguments.get(name)) is not None:
                 bound.arguments[name] = value * growth.to(value)[:, None] ** power

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import Camera
+from clod_adapter.cameras import Camera, intrinsics
 from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.attenuation import check_dial
 from clod_adapter.errors import ClodError
@@ -30,15 +30,13 @@ def camera_of(camera: Any) -> Camera:
     pose = camera.camera_to_worlds.reshape(-1, 3, 4)[0].detach().cpu().float()
     rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
     viewmat = torch.eye(4, dtype=torch.float32)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ pose[:, 3]
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ pose[:, 3]
 
     def number(name: str) -> float:
         return float(getattr(camera, name).flatten()[0])
 
-    K = torch.tensor(
-        [[number("fx"), 0.0, number("cx")], [0.0, number("fy"), number("cy")], [0.0, 0.0, 1.0]],
-        dtype=torch.float32,
-    )
+    K = intrinsics(number("fx"), number("fy"), number("cx"), number("cy"))
     return Camera(viewmat, K, int(number("width")), int(number("height")))
 
 

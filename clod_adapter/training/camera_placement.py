@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from clod_adapter.adapter import detach
-from clod_adapter.cameras import Camera, looking, near_plane
+from clod_adapter.cameras import Camera, intrinsics, looking, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians, nonfinite_rows
@@ -229,10 +229,7 @@ def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
 
 
 def _intrinsics(zoom: float, width: int, height: int) -> Tensor:
-    return torch.tensor(
-        [[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]],
-        dtype=torch.float32,
-    )
+    return intrinsics(zoom * width, zoom * width, width / 2, height / 2)
 
 
 def _quantile(values: Tensor, share: float) -> float:

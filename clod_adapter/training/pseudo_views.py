@@ -65,9 +65,8 @@ class PseudoView(StoredView):
         """
         x, y, z = TURNED * random.standard_normal(3)
         step = torch.eye(4, dtype=torch.float64)  # on the CPU, where cameras are placed
-        step[:3, :3] = torch.tensor(
-            [[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64
-        ).matrix_exp()
+        turn = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+        step[:3, :3] = turn.matrix_exp()
         step[:3, 3] = torch.from_numpy(MOVED * self.reach * random.standard_normal(3))
         zoom = math.exp(ZOOMED * (2 * random.random() - 1))
         viewmat = (step @ self.camera.viewmat.double()).to(self.camera.viewmat)

@@ -124,7 +124,8 @@ class ViewSampler:
 
     def restore(self, random: dict[str, Any], order: tuple[int, ...]) -> None:
         """The inverse of ``state``."""
-        if not all(0 <= view < len(self.views) for view in order) or len(set(order)) < len(order):
+        known = all(0 <= view < len(self.views) for view in order)
+        if not known or len(set(order)) < len(order):
             raise ClodError(OTHER_RUN)
         try:
             self.random.bit_generator.state = random
