@@ -77,7 +77,8 @@ def main() -> None:
     if args.device == "cuda":
         if not torch.cuda.is_available():
             sys.exit("torch sees no GPU here: give --device cpu --small to try the script")
-        cuda.require_gsplat()
+        if reason := cuda.unusable():
+            sys.exit(reason)
     size = SMALL if args.small else Size()
     size = replace(size, count=args.count or size.count)
     for name in args.only:

@@ -26,7 +26,7 @@ WIDEST = 4.0
 # Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB
 # (docs/performance.md).
 MOST_VIEWS = 64
-NEAREST = 0.05  # share of the views that may be nearer than where growth begins
+NEAREST_VIEWS = 0.05  # share of the views that may be nearer than where growth begins
 
 
 def initialize(
@@ -132,12 +132,12 @@ def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
 def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     """D of training, world units: the median distance in the frustum, of the nearest views.
 
-    The farthest of the NEAREST share of the views, and at least the second nearest of three or
-    more. Growth begins there: nearer, stored scales and opacities must fill the gaps
+    The farthest of the NEAREST_VIEWS share of the views, and at least the second nearest of three
+    or more. Growth begins there: nearer, stored scales and opacities must fill the gaps
     (docs/method.md, "Near to far").
     """
     medians = sorted(median_distance(base.means, view.camera) for view in views)
-    return medians[max(math.ceil(NEAREST * len(medians)), 2 if len(medians) > 2 else 1) - 1]
+    return medians[max(math.ceil(NEAREST_VIEWS * len(medians)), 2 if len(medians) > 2 else 1) - 1]
 
 
 def removal_error(
