@@ -26,7 +26,7 @@ from shown import Shown, serve  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
 SIZE = {"width": 1280, "height": 800}
-DIAL = 5.0
+DIAL = 3.0
 
 
 def main() -> None:

@@ -62,7 +62,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         path.unlink(missing_ok=True)
     if report["rows"]:
         draw(capture, base, model, report, pictures)
-        drawn = "dial.png shows a view at several dial values, curve.png quality against count"
+        drawn = "dial.png shows a view, curve.png quality against count, beside merging"
     else:
         pictures, drawn = {}, "no figures: the measurements were interrupted"
     print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}\n{drawn}")
@@ -84,6 +84,7 @@ outputs in DIR:
   capture/          80 images and their COLMAP model
   base.ply          the checkpoint
   gallery.ply       the adapted file; gallery.safetensors, gallery.json
-  dial.png          one held-out view: photograph, base, several dial values
-  curve.png         quality against the number of Gaussians
+  dial.png          one held-out view: the checkpoint, the dial at a fifth of
+                    its Gaussians, and the checkpoint merged to as many
+  curve.png         quality against the number of Gaussians, merging beside it
 """
