@@ -162,7 +162,10 @@ def list_all() -> int:
         print(f"make {target}: {minutes} minutes on two cores")
     pages = "".join(page.read_text("utf-8") for page in PAGES)
     for name, make in TABLES.items():
-        if len(origins(make().rows)) > 1:
+        found = origins(make().rows)
+        if not found:
+            print(f"table {name}: no rows: run {name}")
+        elif len(found) > 1:
             print(f"table {name}: rows of several commits: run {name}")
         elif f"<!-- table: {name} -->" not in pages:
             print(f"table {name}: rows of one commit; no page has its marks")
