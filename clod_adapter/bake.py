@@ -12,7 +12,12 @@ from torch import Tensor
 
 from clod_adapter.cameras import Camera
 from clod_adapter.config import MULTIPLIER, require
-from clod_adapter.equation.attenuation import TAKEOVER, Attenuated, check_dial, dial
+from clod_adapter.equation.attenuation import (
+    Attenuated,
+    check_dial,
+    dial,
+    takeover_distance,
+)
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
@@ -197,9 +202,7 @@ def _of_several(
     kept, shown = (dial(whole, distances, s) for s in (virtual_scale, virtual_scale**FADED))
     if near is not None:
         assert attenuation is not None
-        middle = (
-            math.sqrt(1 - 0.5 / TAKEOVER) * attenuation.near_distance / attenuation.scene_distance
-        )
+        middle = takeover_distance(attenuation, 0.5)
         kept = kept._replace(keep=kept.keep & (near != (distances * virtual_scale >= middle)))
     return kept, shown
 

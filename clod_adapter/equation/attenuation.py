@@ -163,6 +163,13 @@ def takeover(far: Tensor, near: float) -> Tensor:
     return progress.clamp(0, 1)
 
 
+def takeover_distance(config: AttenuationConfig, share: float) -> float:
+    """d s at which ``takeover`` is ``share``, in (0, 1], or where it begins, for 0; 0 where there
+    are no near Gaussians.
+    """
+    return math.sqrt(1 - (1 - share) / TAKEOVER) * config.near_distance / config.scene_distance
+
+
 def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:
     """``attenuate`` of Gaussians, seen from a camera, or from distances d ``[N]`` where these are
     known.

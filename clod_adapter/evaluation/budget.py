@@ -12,7 +12,7 @@ was trained, with a note.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import fmean
@@ -23,7 +23,7 @@ from torch import Tensor
 from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, number, require
-from clod_adapter.equation.attenuation import TAKEOVER, dial
+from clod_adapter.equation.attenuation import dial, takeover_distance
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import time_frames
@@ -182,20 +182,15 @@ def _for_count(
     largest, wanted = config.max_sv, math.floor(keep * len(views))
 
     @lru_cache(maxsize=1)  # all at once would be views times Gaussians
-    def between(k: int) -> tuple[Tensor, Tensor]:
+    def kept_in(k: int) -> Callable[[float], Tensor]:
         distances = typical_distance(gaussians.means, views[k], config)
-        return _kept_between(gaussians, distances, config, baked)
+        if config.form == "paper":  # whose cut depends on opacity
+            return lambda s: dial(gaussians, distances, s).keep
+        begin, end = _kept_between(gaussians, distances, config, baked)
+        return lambda s: (begin < s) & (s < end)
 
     def count(virtual_scale: float) -> int:
-        kept = 0
-        for k, view in enumerate(views):
-            if config.form == "paper":  # whose cut depends on opacity
-                distances = typical_distance(gaussians.means, view, config)
-                kept += int(dial(gaussians, distances, virtual_scale).keep.sum())
-            else:
-                begin, end = between(k)
-                kept += int(((begin < virtual_scale) & (virtual_scale < end)).sum())
-        return kept
+        return sum(int(kept_in(k)(virtual_scale).sum()) for k in range(len(views)))
 
     most, fewest = count(1.0), count(largest)
     if wanted >= most:
@@ -234,9 +229,7 @@ def _kept_between(
     begin, end = torch.zeros_like(d), (gaussians.sigma_d.double() / d).masked_fill(d == 0, math.inf)
     if (near := gaussians.near) is None:
         return begin, end
-    taken_over = config.near_distance / config.scene_distance
-    first = taken_over * math.sqrt(1 - (0.5 if baked else 1) / TAKEOVER)
-    last = first if baked else taken_over
+    first, last = (takeover_distance(config, share) for share in ((0.5, 0.5) if baked else (0, 1)))
     return torch.where(near, begin, first / d), torch.where(near, last / d, end)
 
 
