@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.demo import TITLE, VIEW, compared, dial_strip
+from clod_adapter.demo import TITLE, VIEW, compared, dial_strip, merging
 from clod_adapter.io.atomic import atomic_path
 from common import ROOT, arguments
 
@@ -43,7 +43,8 @@ def main() -> None:
 def dial(folder: Path) -> bytes:
     """The strip of the demo."""
     base, model = (clod.load(folder / name).gaussians for name in ("base.ply", "gallery.ply"))
-    panels = compared(base, model, clod.load_scene(folder / "capture"))
+    scene = clod.load_scene(folder / "capture")
+    panels = compared(base, model, scene.test[VIEW], merging(base, scene))
     with tempfile.TemporaryDirectory() as made:
         file = Path(made) / "dial.png"
         dial_strip(file, panels, TITLE)

@@ -3,7 +3,8 @@ results.
 """
 
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter.cameras import Scene, spread
+from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.budget import matching_dial
 from clod_adapter.evaluation.evaluate import evaluate
@@ -54,34 +55,35 @@ def draw(
     held-out views.
     """
     scene, original = load_scene(capture), load(base).gaussians
-    strip = compared(original, load(model).gaussians, scene)
+    merged_to = merging(original, scene)
+    strip = compared(original, load(model).gaussians, scene.test[VIEW], merged_to)
     dial_strip(pictures["dial"], strip, TITLE)
     merged = []
-    for rival in merged_to([round(row["kept"]) for row in report["rows"]], original, scene):
-        merged += [row.as_dict() for row in evaluate(rival, scene.test, 1.0)]
+    for row in report["rows"]:
+        (measured,) = evaluate(merged_to(round(row["kept"])), scene.test, 1.0)
+        merged.append(measured.as_dict())
     with new_figure((6.4, 5.6), layout="constrained") as figure:
         quality_curve(figure, report["rows"], merged, report["base_rows"][0])
         save_figure(figure, pictures["curve"])
 
 
-def merged_to(counts: Sequence[int], base: Gaussians, scene: Scene) -> list[Gaussians]:
-    """The base merged to each of ``counts`` by importance for the photographs, without training."""
-    weights = importance(base, spread(scene.train, MOST_VIEWS), AdaptConfig())
-    return [merge(base, weights, count) for count in counts]
+def merging(base: Gaussians, scene: Scene) -> Callable[[int], Gaussians]:
+    """Merges the base to a count, by importance for the photographs, without training."""
+    return partial(merge, base, importance(base, spread(scene.train, MOST_VIEWS), AdaptConfig()))
 
 
-def compared(base: Gaussians, model: Gaussians, scene: Scene) -> list[Picture]:
-    """Panels of one held-out view: the base, the dial at SHARE of the Gaussians, and the base
-    merged to as many. Frame times are left out where the machine is busy.
+def compared(
+    base: Gaussians, model: Gaussians, view: View, merged_to: Callable[[int], Gaussians]
+) -> list[Picture]:
+    """Panels of one view: the base, the dial at SHARE of the Gaussians, and the base merged to as
+    many. Frame times are left out where the machine is busy.
     """
-    view = scene.test[VIEW]
     s = matching_dial(model, [view.camera], SHARE * len(base))
     (row,) = evaluate(model, [view], s)
-    (merged,) = merged_to([round(row.kept)], base, scene)
     shown = [
         ("the checkpoint", base, 1.0),
         (f"the dial at s = {s:.2g}", model, s),
-        ("the checkpoint, merged to as many", merged, 1.0),
+        ("the checkpoint, merged to as many", merged_to(round(row.kept)), 1.0),
     ]
     times = time_frames([(gaussians, [s]) for _, gaussians, s in shown], [view.camera])
     panels = []
