@@ -21,7 +21,6 @@ import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -75,8 +74,9 @@ def main() -> None:
             run = Process([*COMMAND, args.scene, *words, "--out", out, "--json", "--accept-loss"])
             row = {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
             append(FILE, {"scene": scene, **row}, args.record)
-        sets = sets_of(args.scene, args.author, out, folder)
-        for row in chain(of_dial(base, out, views), of_sets(base, sets, views)):
+        for row in of_dial(base, out, views):
+            append(FILE, {"scene": scene, **row}, args.record)
+        for row in of_sets(base, sets_of(args.scene, args.author, out, folder), views):
             append(FILE, {"scene": scene, **row}, args.record)
 
 

@@ -44,14 +44,13 @@ def with_frame_times(
         jobs.append((model, sorted({row.virtual_scale for row in rows})))
     times = time_frames(jobs, [view.camera for view in views], progress)
     found = list[list[Row]]()
-    for (_, rows), (_, dials), *taken in zip(
+    for (_, rows), (_, dials), milliseconds, ranges in zip(
         measured, jobs, times.milliseconds, times.ranges, strict=True
     ):
-        by_dial = dict(zip(dials, zip(*taken, strict=True), strict=True))
         timed = list[Row]()
         for row in rows:
-            middle, between = by_dial[row.virtual_scale]
-            timed.append(replace(row, frame_ms=middle, frame_ms_range=between))
+            k = dials.index(row.virtual_scale)
+            timed.append(replace(row, frame_ms=milliseconds[k], frame_ms_range=ranges[k]))
         found.append(timed)
     return found, times.notes
 

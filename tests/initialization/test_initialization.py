@@ -14,11 +14,7 @@ from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.initialization import pruning_order as pruning
-from clod_adapter.initialization.importance import (
-    initialize,
-    removal_error,
-    usable_views,
-)
+from clod_adapter.initialization.importance import initialize, removal_error, usable_views
 from clod_adapter.initialization.pruning_order import (
     APART,
     COLOUR_FLOOR,
