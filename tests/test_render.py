@@ -5,10 +5,8 @@ store something else.
 import math
 import re
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
@@ -179,7 +177,6 @@ DEFAULTS = AttenuationConfig()
 MODEL = with_dial(gaussians(N, 1, 0), torch.ones(N), DEFAULTS, torch.ones(N))
 HOOK = Hook(MODEL.sigma_d, DEFAULTS, 2.0, MODEL.growth_d)
 WHOLE = torch.ones(N, dtype=torch.int64)
-Drawing = Callable[..., Any]
 
 
 @pytest.fixture

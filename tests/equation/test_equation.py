@@ -15,7 +15,7 @@ from refusals import refused
 from clod_adapter import AttenuationConfig
 from clod_adapter.equation.attenuation import LOG_GROWTH_MAX, SIGMA_MAX, attenuate, growth_factors
 from clod_adapter.equation.paper import EPS, TAU, soft_count
-from scenes import camera
+from scenes import camera, seeded
 
 DTYPES = [torch.float32, torch.float64]
 LOGITS = [-200.0, -40.0, -6.0, -1.0, 0.0, 2.0, 9.0, 200.0, math.inf]
@@ -86,7 +86,7 @@ def test_drawn_opacities_and_their_gradients_match_mpmath(dtype, scale):
 @each_dtype
 def test_a_reach_ends_where_the_distance_equals_it(dtype):
     """Whatever the opacity; what is kept is drawn with more than 0."""
-    reach = torch.rand(20_000, generator=torch.Generator().manual_seed(0), dtype=dtype) + 0.1
+    reach = torch.rand(20_000, generator=seeded(0), dtype=dtype) + 0.1
     for factor, inside in (
         (1 - torch.finfo(dtype).eps, True),
         (1, False),

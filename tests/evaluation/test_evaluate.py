@@ -5,7 +5,6 @@ budgets: solved dial values keep the counts asked for, and interpolate known cur
 import math
 import random
 import re
-from collections.abc import Callable
 from statistics import fmean
 
 import pytest
@@ -76,7 +75,6 @@ def test_bad_calls_are_named():
 
 
 DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
-Clock = Callable[[Callable[[int, float], float]], list[tuple[str, float]]]
 
 
 @pytest.fixture

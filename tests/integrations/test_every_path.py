@@ -114,7 +114,7 @@ def through_hook(checkpoint, monkeypatch):
 def adapted(**settings):
     """60 Gaussians, of which a third is culled at the dial value, with growth of both signs."""
     some = scenes.dialled(60, 1, 3, **settings)
-    values = torch.rand(60, generator=torch.Generator().manual_seed(5))
+    values = torch.rand(60, generator=scenes.seeded(5))
     return some.replace(
         means=some.means * torch.tensor([1, 1, 0.5]),
         sigma_d=2 * some.sigma_d,
@@ -203,7 +203,7 @@ def test_kept_rows_are_drawn_as_by_the_fork(name, monkeypatch):
     leaves = [
         each for each in (given | dial).values() if isinstance(each, Tensor) and each.requires_grad
     ]
-    weights = torch.rand(got[0].shape, generator=torch.Generator().manual_seed(1))
+    weights = torch.rand(got[0].shape, generator=scenes.seeded(1))
     slopes = [torch.autograd.grad((picture[0] * weights).sum(), leaves) for picture in (got, want)]
     for leaf, mine, of_fork in zip(leaves, *slopes, strict=True):
         assert mine.shape == leaf.shape and not mine[~keep].any()
@@ -238,7 +238,7 @@ def test_covariances_grow_by_the_square(monkeypatch):
     assert growth.min() < 0.9 and growth.max() > 1.1
     given |= {
         "rotations": None,
-        "cov3D_precomp": torch.rand(60, 6, generator=torch.Generator().manual_seed(3)),
+        "cov3D_precomp": torch.rand(60, 6, generator=scenes.seeded(3)),
     }
     words = inria_forks.CALL.split()
     for values, names in (

@@ -18,7 +18,7 @@ import gsplat_versions
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
-from scenes import camera, ring, scene
+from scenes import camera, ring, scene, seeded
 
 N, WIDTH, HEIGHT = 40, 40, 28
 WHOLE = AttenuationConfig()  # changes no opacity where the reach is infinite
@@ -133,10 +133,10 @@ def test_attenuated_results_match_gsplat_per_camera(tools, cameras, packed, form
     config = AttenuationConfig(form=form, scene_distance=6.0)
     given, views = arguments(cameras, device=tools.device)
     if growing == "covars":
-        axes = torch.randn(N, 3, 3, generator=torch.Generator().manual_seed(5)).to(tools.device)
+        axes = torch.randn(N, 3, 3, generator=seeded(5)).to(tools.device)
         given["covars"] = 0.02 * axes @ axes.mT + 0.01 * torch.eye(3, device=tools.device)
         given["quats"] = given["scales"] = None
-    sigma_d = 0.2 + 2 * torch.rand(N, generator=torch.Generator().manual_seed(7)).to(tools.device)
+    sigma_d = 0.2 + 2 * torch.rand(N, generator=seeded(7)).to(tools.device)
     dial = {"sigma_d": sigma_d} | ({"growth_d": sigma_d - 1} if growing else {})
     leaves = {**given, "viewmats": views.pop("viewmats"), **dial}
     leaves = {
@@ -169,7 +169,7 @@ def test_attenuated_results_match_gsplat_per_camera(tools, cameras, packed, form
     points = [ours[2]["means2d"], *(part[2]["means2d"] for part in theirs)]
     for point in points:
         point.retain_grad()
-    weights = torch.rand(ours[0].shape, generator=torch.Generator().manual_seed(1)).to(tools.device)
+    weights = torch.rand(ours[0].shape, generator=seeded(1)).to(tools.device)
     loss = (ours[0] * weights).sum() + ours[1].sum()
     of_theirs = sum(
         (part[0] * w).sum() + part[1].sum() for part, w in zip(theirs, weights, strict=True)

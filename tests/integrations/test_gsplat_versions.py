@@ -14,6 +14,7 @@ import gsplat_versions
 from backends import fresh_copy
 from clod_adapter.config import AttenuationConfig
 from gsplat_versions import FUNCTIONS
+from scenes import seeded
 
 N = 5
 WIDTH = 20
@@ -67,7 +68,7 @@ class Gsplat:
         """Every tensor that a function takes, random; of cameras the position and the principal
         point.
         """
-        generator = torch.Generator().manual_seed(0)
+        generator = seeded(0)
         shapes = {key: (*batch, *shape) for key, shape in OF_SCENE.items()}
         shapes |= {key: (*batch, cameras, *shape) for key, shape in OF_CAMERA.items()}
         given = {key: 0.1 + torch.rand(shape, generator=generator) for key, shape in shapes.items()}

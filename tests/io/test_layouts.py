@@ -40,7 +40,7 @@ from formats import (
     turned,
     write_rows,
 )
-from scenes import camera, gaussians
+from scenes import camera, gaussians, seeded
 
 KHR = "KHR_gaussian_splatting"
 
@@ -237,9 +237,7 @@ def test_axes_of_an_spz(tmp_path, axes, signs):
     other, turn = load(tmp_path / "b.spz").gaussians, torch.diag(torch.tensor(signs))
     assert torch.equal(other.means, ours.means @ turn)
     assert_close(covariances(other), turn.double() @ covariances(ours) @ turn.double())
-    seen = torch.nn.functional.normalize(
-        torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
-    )
+    seen = torch.nn.functional.normalize(torch.randn(40, 3, generator=seeded(0)))
     drawn = (
         (sh_basis(u)[:, 1:16, None] * g.shN).sum(1) for u, g in ((seen, ours), (seen @ turn, other))
     )

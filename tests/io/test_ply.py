@@ -18,6 +18,7 @@ from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import Checkpoint, load, save
 from clod_adapter.io.ply import COLOURED, UNPREFIXED
 from formats import examples, model, needed, random_rows, resaved, write_elements, write_rows
+from scenes import seeded
 
 CONFIG = AttenuationConfig(form="paper", max_sv=7.0)
 
@@ -76,7 +77,7 @@ def test_every_layout_round_trips(tmp_path, file, seed):
     for name, values in (columns | {"opacity": g.opacity_logits}).items():
         assert_array_equal(values, f32[name])
 
-    generator, changes = torch.Generator().manual_seed(seed), {}
+    generator, changes = seeded(seed), {}
     for name, old in g.tensors().items():
         touched = torch.rand(old.shape, generator=generator) < 0.3 * (seed % 2)
         changes[name] = torch.where(touched, torch.randn(old.shape, generator=generator), old)

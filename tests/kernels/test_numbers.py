@@ -19,6 +19,7 @@ from clod_adapter._kernels.simd import load, store
 from clod_adapter.config import AdaptConfig
 from clod_adapter.losses import photometric_loss
 from clod_adapter.training.target_count import count_gradient
+from scenes import seeded
 
 CONFIG = AdaptConfig(max_sv=7.0)
 
@@ -32,7 +33,7 @@ CONFIG = AdaptConfig(max_sv=7.0)
     workers=st.sampled_from([1, 3]),
 )
 def test_both_forms_of_the_count_term_agree(n, s, seed, share, workers):
-    random = torch.Generator().manual_seed(seed)
+    random = seeded(seed)
     d = 2 * torch.rand(n, generator=random)
     sigma = s * d * (torch.randn(n, generator=random) / 4).exp()
     with torch_threads(workers):
@@ -90,7 +91,7 @@ def pair(height, width, seed=0):
     """A smooth photograph with black and white parts, and a render of it that also leaves
     [0, 1].
     """
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     waves = torch.sin(x[..., None] / torch.tensor([3.0, 5.0, 9.0]) + y[..., None] / 4)
     clean = (0.5 + 0.8 * waves).clamp(0, 1)

@@ -16,7 +16,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, FILTERS, ScreenFilter
 from clod_adapter.rasterizers import reference
 from oracle import BACKGROUND, IMAGE, ON_A_CUT, assert_agrees
-from scenes import camera, in_front, scene
+from scenes import camera, in_front, scene, seeded
 
 
 def harmonics(direction):
@@ -73,9 +73,7 @@ def drawn(some, view, screen_filter):
 def test_images_are_those_of_plain_loops(screen_filter):
     """Of 80 Gaussians within the picture; a part of its pixels ends."""
     view, some = camera(41, 31), scene(80, 4, 3, size=0.3)
-    places = torch.rand(80, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor(
-        [0.5, 0.5, -2.0]
-    )
+    places = torch.rand(80, 3, generator=seeded(0)) - torch.tensor([0.5, 0.5, -2.0])
     some["means"] = in_front(
         view, places * torch.cat([0.8 * places[:, 2:].expand(80, 2), torch.ones(80, 1)], 1)
     )

@@ -13,7 +13,7 @@ from backends import torch_threads
 from clod_adapter.config import FORMS, ScreenFilter
 from clod_adapter.equation.attenuation import SIGMA_MAX, dial
 from clod_adapter.rasterizers import Rasterizer, cpu, for_device, reference
-from scenes import camera, dialled, gaussians
+from scenes import camera, dialled, gaussians, seeded
 
 VIEW = camera(45, 37)
 KERNELS, COMPOSED = for_device(torch.device("cpu")), Rasterizer(cpu.rasterize)
@@ -23,7 +23,7 @@ SHAPE, COLOUR = ("means", "quats", "log_scales", "growth_d"), ("sh0", "shN")
 
 def results(rasterizer, model, s, *frozen):
     """Image and alpha, and the gradients of a random weighting of them, by attribute."""
-    random = torch.Generator().manual_seed(3)
+    random = seeded(3)
     leaves = {
         name: x.clone().requires_grad_(name not in frozen) for name, x in model.tensors().items()
     }

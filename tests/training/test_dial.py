@@ -7,14 +7,13 @@ from refusals import refused
 from torch.testing import assert_close
 
 import clod_adapter as clod
-from clod_adapter import AdaptConfig, Gaussians, Scene
+from clod_adapter import AdaptConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.losses import photometric_loss
 from clod_adapter.training.dial import SIGMA_RANGE, attach
 from clod_adapter.training.schedule import OURS, Sample
 from clod_adapter.training.trainer import Trainer
 
-Pair = tuple[Gaussians, Scene]
 MAX_SV = 5.0
 
 

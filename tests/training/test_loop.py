@@ -13,7 +13,7 @@ from refusals import refused
 from torch.testing import assert_close
 from torch.torch_version import TorchVersion
 
-from clod_adapter import Gaussians, Phase, Scene, Stopped, evaluate, make_plan
+from clod_adapter import Phase, Scene, Stopped, evaluate, make_plan
 from clod_adapter.adapter import ATTRIBUTES, detach, with_dial
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.distances import in_frustum
@@ -24,8 +24,6 @@ from clod_adapter.training.far import with_far
 from clod_adapter.training.loop import adapt
 from runs import change_step, config_of, states_of
 from scenes import assert_equal, capture, gaussians, photograph, ring
-
-Pair = tuple[Gaussians, Scene]
 
 
 @pytest.fixture(scope="module")

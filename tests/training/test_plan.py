@@ -9,7 +9,7 @@ import pytest
 import torch
 from refusals import refused
 
-from clod_adapter import AdaptConfig, Decision, Gaussians, Override, Scene, make_plan, render
+from clod_adapter import AdaptConfig, Decision, Override, Scene, make_plan, render
 from clod_adapter.adapter import detach
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.training.far import supposed_error
@@ -17,10 +17,8 @@ from clod_adapter.training.plan import NAMES, NOT_NEEDED
 from runs import states_of
 from scenes import assert_equal, gaussians, photograph, ring
 
-Pair = tuple[Gaussians, Scene]
 CONFIG = AdaptConfig(iters=20, max_sv=4.0, start_share=0.62)
 ALL = frozenset(NAMES)
-LIMIT = 0.02
 
 
 @pytest.fixture(scope="module")

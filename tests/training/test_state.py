@@ -17,7 +17,6 @@ import clod_adapter as clod
 from clod_adapter import (
     AdaptConfig,
     AttenuationConfig,
-    Gaussians,
     Scene,
     View,
     adapt,
@@ -33,9 +32,6 @@ from clod_adapter.training import trainer
 from clod_adapter.training.pseudo_views import reaches
 from runs import config_of, pressing, states_of
 from scenes import assert_equal, capture, gaussians, photograph, ring, seeded
-
-Pair = tuple[Gaussians, Scene]
-
 
 RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 RESUMED = {
