@@ -51,18 +51,18 @@ def measure() -> list[Row]:
         gaussians, cameras = scene(form)
         gaussians = gaussians.replace(growth_d=torch.full((len(gaussians),), growth))
         for sweep, steps in product(SWEEPS, STEPS):
-            popping = _sweep(gaussians, cameras, sweep, steps)
+            popping = swept(gaussians, cameras, sweep, steps)
             row = {"form": form, "growth": growth, "sweep": sweep, "steps": steps}
             row |= {"pixel": popping.pixel, "persistence": popping.pixel_persistence}
             rows.append(row)
     return rows
 
 
-def scene(form: str) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
+def scene(form: str, others: int = OTHERS) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
     """The Gaussians, and by name of the sweep the cameras it goes through."""
     draw = torch.Generator().manual_seed(0)
-    n = OTHERS + TOGETHER + 3
-    together = slice(OTHERS, OTHERS + TOGETHER)
+    n = others + TOGETHER + 3
+    together = slice(others, others + TOGETHER)
     front, back, far = range(n - 3, n)
     eye = torch.tensor([0.0, 0.0, -DISTANCE])
     line = torch.tensor([-0.25, 0.15, 1.0])
@@ -107,9 +107,10 @@ def _looking(eye: Tensor, at: Tensor) -> clod.Camera:
     return replace(camera, K=K)
 
 
-def _sweep(
+def swept(
     gaussians: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int
 ) -> Popping:
+    """The popping of a sweep, in so many steps."""
     if sweep in ("turn", "path"):
         return path_popping(gaussians, cameras[sweep], SCALE, steps=steps)
     if sweep == "pair":  # the others stay, for the paper's unit of distances
