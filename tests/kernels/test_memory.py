@@ -8,18 +8,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from clod_adapter._kernels import threads
-from clod_adapter._kernels.memory import IDLE, recycled, recycled_array, release
+from clod_adapter._kernels.memory import IDLE, recycled, release
 from clod_adapter._support.workers import in_order, shared
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -96,17 +93,6 @@ def nothing_idle():
     release()
 
 
-def test_shapes_and_alignment():
-    for shape in [(), (100_000, 0, 3), (16_383,), (16_384,), torch.Size((9, 9999))] * 3:
-        tensor = recycled(shape)
-        assert tensor.shape == shape and tensor.dtype == torch.float32 and tensor.is_contiguous()
-        for dtype in (np.float32, np.int32, np.uint64):
-            array = recycled_array(shape, dtype)
-            assert array.shape == shape and array.dtype == dtype and array.flags.c_contiguous
-            assert array.size < 16_384 or array.ctypes.data % 64 == 0
-        tensor.fill_(1)
-
-
 @pytest.mark.parametrize("holder", HOLDERS)
 def test_held_memory_is_not_used_again(holder):
     tensor = recycled(SHAPE).fill_(7)
@@ -123,39 +109,6 @@ def test_held_memory_is_not_used_again(holder):
     before = {other.data_ptr() for other in others} | {first}
     others.clear()
     assert {recycled(SHAPE).data_ptr() for _ in range(IDLE)} <= before
-
-
-def test_threads_never_get_the_same_memory():
-    """Each fills tensors with a number, which is unchanged until another thread releases them."""
-    passed = deque[tuple[Tensor, float]]()
-
-    def work(k):
-        for turn in range(300):
-            tensor, number = recycled(((20_000, 20_001, 40_000)[turn % 3],)), float(k * 300 + turn)
-            passed.append((tensor.fill_(number), number))
-            while len(passed) > turn % 7 + 4:
-                tensor, number = passed.popleft()
-                assert (tensor == number).all()
-
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)  # as often as possible
-    try:
-        with ThreadPoolExecutor(4) as pool:
-            list(pool.map(work, range(4)))
-    finally:
-        sys.setswitchinterval(before)
-
-
-def test_results_come_in_order():
-    def late(number):
-        time.sleep(0.01 * (number % 3))
-        return number, threading.get_ident()
-
-    found = list(in_order([partial(late, number) for number in range(20)], 3))
-    assert [number for number, _ in found] == list(range(20)) and len(
-        {thread for _, thread in found}
-    ) == 3
-    assert list(in_order([], 3)) == []
 
 
 def test_an_error_is_raised_after_started_calls_end():
