@@ -1,21 +1,15 @@
-"""Compiled functions against plain ones in float64: the elementary functions, the count term, the
-losses.
-"""
+"""Compiled functions against plain ones in float64: the count term, the losses."""
 
 import math
 from itertools import product
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
 
 from backends import torch_threads
 from clod_adapter import losses
-from clod_adapter._kernels.elementary import exp2, log2
-from clod_adapter._kernels.simd import load, store
 from clod_adapter.config import AdaptConfig
 from clod_adapter.losses import photometric_loss
 from clod_adapter.training.target_count import count_gradient
@@ -54,33 +48,6 @@ def test_the_count_term_of_extreme_values_is_finite():
         d, sigma = torch.cartesian_prod(*(edge.to(dtype) for edge in edges)).unbind(1)
         found = count_gradient(d, sigma, 3.0, 0.1, CONFIG, share)
         assert found.isfinite().all() and found.any()
-
-
-@njit
-def elementary(function, x, out):
-    for at in range(0, len(x), 16):
-        store(out, at, exp2(load(x, at)) if function == 0 else log2(load(x, at)))
-
-
-def test_errors_of_exp2_and_log2():
-    """Of exp2 relative, over what blending needs, [-126, 0], and above. Of log2 absolute, beside
-    one and a half units of the result (tests/other_libm); for every fifth mantissa of two octaves
-    and all normal exponents.
-    """
-    some = np.concatenate(
-        [np.linspace(-126, 127, 1_000_001), -np.logspace(-30, 2.1, 100_001)]
-    ).astype(np.float32)
-    octaves = np.float32(0.5).view(np.uint32) + np.arange(0, 1 << 24, 5, dtype=np.uint32)
-    every = np.arange(0x00800000, np.float32(3.4e38).view(np.uint32), 997, dtype=np.uint32)
-    inputs = some[some >= -126], np.concatenate([octaves, every]).view(np.float32)
-    for function, (x, exact) in enumerate(zip(inputs, (np.exp2, np.log2), strict=True)):
-        x = np.resize(x, -(-len(x) // 16) * 16)  # whole vectors
-        found, want = np.empty_like(x), exact(x.astype(np.float64))
-        elementary(function, x, found)
-        errors, units = np.abs(found - want), np.spacing(np.abs(want).astype(np.float32))
-        assert (
-            (errors / want < 3e-7).all() if function == 0 else (errors - 1.5 * units < 1e-7).all()
-        )
 
 
 # Smaller than the window of 11, one larger, multiples of 16 and not.

@@ -5,9 +5,9 @@ the last place.
 
 The value of OTHER_LIBM is a seed, which says for each result whether it moves up or down; equal
 results move alike. Powers of two, whole numbers below 1024, infinities and NaN stay, so no sigmoid
-exceeds 1. ``math``, NumPy's functions, torch's on the CPU and the kernels' are moved, each in its
-own way, as libraries differ. Python runs this file at its start, also in processes that a test
-starts.
+exceeds 1. ``math``, NumPy's functions and torch's on the CPU are moved, each in its own way, as
+libraries differ; the kernels' are polynomials of their own. Python runs this file at its start,
+also in processes that a test starts.
 """
 
 import importlib.machinery
@@ -141,40 +141,6 @@ def change_torch(torch: ModuleType) -> None:
                 change(name)
 
 
-def change_kernels(elementary: ModuleType) -> None:
-    from llvmlite import ir
-    from numba.extending import intrinsic
-
-    def constant(type_: Any, value: float) -> Any:
-        return ir.Constant(type_, [value] * elementary.LANES)
-
-    def moved(original: Any) -> Any:
-        signature, codegen = original._defn(None, None)
-
-        @intrinsic
-        def other(typingctx, x):
-            def code(context, builder, signature, args):
-                y = codegen(context, builder, signature, args)
-                bits = builder.bitcast(y, elementary.INTEGERS)
-                mixed = builder.mul(bits, constant(elementary.INTEGERS, 0x9E3779B1))
-                mixed = builder.add(mixed, constant(elementary.INTEGERS, salt("kernels")))
-                sign = builder.ashr(mixed, constant(elementary.INTEGERS, 31))
-                step = builder.or_(sign, constant(elementary.INTEGERS, 1))  # 1 or -1
-                other = builder.bitcast(builder.add(bits, step), elementary.VECTOR)
-                floor = elementary.call_llvm(builder, "llvm.floor.v16f32", elementary.VECTOR, [y])
-                digits = builder.and_(bits, constant(elementary.INTEGERS, (1 << 23) - 1))
-                power = builder.icmp_unsigned("==", digits, constant(elementary.INTEGERS, 0))
-                return builder.select(
-                    builder.or_(power, builder.fcmp_unordered("==", y, floor)), y, other
-                )
-
-            return signature, code
-
-        return other
-
-    elementary.exp2, elementary.log2 = moved(elementary.exp2), moved(elementary.log2)
-
-
 def change_stamp(compiling: ModuleType) -> None:
     # compiled code of its own
     compiling._STAMP += f"{SEED} {zlib.crc32(Path(__file__).read_bytes())}"
@@ -186,7 +152,6 @@ class Finder:
     CHANGES = {
         "numpy": change_numpy,
         "torch": change_torch,
-        "clod_adapter._kernels.elementary": change_kernels,
         "clod_adapter._kernels.compiling": change_stamp,
     }
 
