@@ -7,13 +7,14 @@ import math
 
 import mpmath
 import pytest
+import stability_equation
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refused
 
 from clod_adapter import AttenuationConfig
-from clod_adapter.equation.attenuation import LOG_GROWTH_MAX, SIGMA_MAX, attenuate, growth_factors
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate, growth_factors
 from clod_adapter.equation.paper import EPS, TAU, soft_count
 from scenes import camera, seeded
 
@@ -21,9 +22,7 @@ DTYPES = [torch.float32, torch.float64]
 LOGITS = [-200.0, -40.0, -6.0, -1.0, 0.0, 2.0, 9.0, 200.0, math.inf]
 SIGMAS = [-1.0, 0.0, 1e-12, 1e-3, 0.4, 1.0, 30.0, 1e6, SIGMA_MAX]
 DISTANCES = [0.0, 1e-7, 1e-3, 0.1, 0.7, 1.5]
-SHARES = [0.0, 1e-6, 0.01, 0.3, 0.9, 1 - 1e-6, 1 + 1e-6, 3.0]  # t, before d is rounded
 SCALES = [1.0, 1.75, 7.0, 1e4]
-EXPONENTS = [-300.0, -1.0, -0.3, 0.0, 1e-6, 0.5, 0.75, 1.0, 3.0, 17.0]
 OURS, PAPER = AttenuationConfig(), AttenuationConfig(form="paper")
 
 mpmath.mp.dps = 50
@@ -36,51 +35,25 @@ def grid(dtype, *axes):
     return list(torch.tensor(list(itertools.product(*axes)), dtype=dtype).unbind(1))
 
 
-def assert_close(got, want, allowed, floor=None):
-    """Errors within ``allowed`` times the wanted value, or ``floor``, or the smallest normal; too
-    large means inf.
-    """
-    info = torch.finfo(got.dtype)
+def assert_close(got, want, allowed):
+    """Errors within ``allowed`` times the wanted value, or the smallest normal."""
+    tiny = torch.finfo(got.dtype).tiny
     for i, (g, w) in enumerate(zip(got.tolist(), want, strict=True)):
-        if abs(w) > info.max:
-            assert g == math.copysign(math.inf, w), (i, g, w)
-        else:
-            least = max(info.tiny, floor[i]) if floor else info.tiny
-            assert abs(mpf(g) - w) <= max(allowed[i] * abs(w), least), (i, g, w)
+        assert abs(mpf(g) - w) <= max(allowed[i] * abs(w), tiny), (i, g, w)
 
 
 def opacity(logit):
     return ONE if logit == math.inf else 1 / (1 + mpmath.exp(-mpf(logit)))
 
 
-@each_dtype
-@pytest.mark.parametrize("scale", SCALES)
-def test_drawn_opacities_and_their_gradients_match_mpmath(dtype, scale):
-    """Within the bounds that the module states; just inside the reach, at its end and just
-    beyond.
+def test_errors_are_within_the_bounds_that_the_module_states():
+    """Drawn opacities, growth and their gradients on the benchmark's random inputs, over all
+    magnitudes and from far inside the reach to just beyond it.
     """
-    logits, sigma, share = grid(dtype, LOGITS, SIGMAS, SHARES)
-    d = (sigma.double().abs().clamp(min=1e-9) * share.double() / scale).to(dtype)
-    leaves = logits.requires_grad_(), sigma.requires_grad_()
-    out = attenuate(logits, sigma, d, scale, OURS)
-    by_logit, by_sigma = torch.autograd.grad(out.drawn.sum(), leaves)
-    want, slopes, of_sigma = [], [], []
-    kept, allowed = [], []
-    eps = torch.finfo(dtype).eps
-    for x, reach, distance in zip(logits.tolist(), sigma.tolist(), d.tolist(), strict=True):
-        a, far = opacity(x), mpf(distance) * mpf(scale)
-        t = ZERO if far == 0 else far / mpf(reach) if far < reach else ONE
-        kept.append(t < 1)
-        want.append(a * (1 - t**4))
-        slopes.append(want[-1] * (1 - a))
-        of_sigma.append(4 * a * t**4 / mpf(reach) if 0 < t < 1 else ZERO)
-        allowed.append(2 * eps + (2**-52 / float(1 - t) if t < 1 else 0))
-    assert out.keep.tolist() == kept and 0 < sum(kept) < len(kept)
-    assert_close(out.drawn.detach(), want, allowed)
-    assert_close(
-        by_logit, slopes, [0.0] * len(want), [x * w for x, w in zip(allowed, want, strict=True)]
-    )
-    assert_close(by_sigma, of_sigma, [6 * eps] * len(want))
+    rows = stability_equation.measure()
+    assert len(rows) == len(DTYPES) * len(stability_equation.BOUNDS)
+    for row in rows:
+        assert row["failed"] == row["nan"] == 0 and row["points"] > 9000, row
 
 
 @each_dtype
@@ -241,30 +214,6 @@ def test_the_papers_form_is_its_formula(dtype, scale):
     count = soft_count(logits, leaf, d.double() * scale, scale, 0.5)
     assert count.item() == pytest.approx(out.keep.double().mean().item(), abs=1e-2 / len(d))
     assert all(x.isfinite().all() for x in torch.autograd.grad(count, leaf))
-
-
-@each_dtype
-@pytest.mark.parametrize(
-    ("scale", "reach"), [*zip(SCALES, [1e-3, 0.3, 1.0, 4.2], strict=True), (7.0, 1e-3)]
-)
-def test_growth_and_its_slope_match_mpmath(dtype, scale, reach):
-    h, d = grid(dtype, EXPONENTS, [*DISTANCES, 1.0000001, 5e3])
-    out = growth_factors(h.requires_grad_(), d, scale, reach)
-    (slope,) = torch.autograd.grad(out.sum(), h)
-    eps = torch.finfo(dtype).eps
-    want, slopes = [], []
-    allowed, of_slopes = [], []
-    for a, b in zip(h.tolist(), d.tolist(), strict=True):
-        log_m = max(mpmath.log(mpf(b) * scale / mpf(reach)), ZERO) if b else ZERO
-        log_g = a * log_m
-        clamped = min(max(log_g, -LOG_GROWTH_MAX), LOG_GROWTH_MAX)
-        want.append(mpmath.exp(clamped))
-        slopes.append(mpmath.exp(log_g) * log_m if clamped == log_g else ZERO)
-        allowed.append(eps * (4 + 2 * abs(a) * (1 + float(log_m))))
-        of_slopes.append(allowed[-1] + 2 * eps / max(float(log_m), 1e-9))
-    assert_close(out.detach(), want, allowed)
-    assert_close(slope, slopes, of_slopes)
-    assert sum(g > 1 for g in want) > 5
 
 
 @each_dtype
