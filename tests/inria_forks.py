@@ -1,9 +1,8 @@
-"""Stand-ins for forks of diff-gaussian-rasterization: their signatures, drawn with the package's
-own rasterizer.
+"""Stand-ins for diff-gaussian-rasterization, drawn with the package's own rasterizer: Inria's of
+2024, and a fork with what others add.
 
-Signatures and results from their sources: Inria's of 2023 and of 2024, MonoGS's "w-pose",
-Mip-Splatting's with depth and alpha, feature-3dgs. All of them cull what is nearer than 0.2 before
-anything else.
+These are Mip-Splatting's ``kernel_size``, arguments of feature-3dgs among Inria's and of MonoGS
+after them, and results in another order. All cull what is nearer than 0.2 before anything else.
 """
 
 from collections import namedtuple
@@ -17,22 +16,22 @@ from torch import Tensor, nn
 from clod_adapter import Camera, ScreenFilter
 from clod_adapter.rasterizers.cpu import rasterize
 
-NEAREST = 0.2
 SETTINGS = (
     "image_height image_width tanfovx tanfovy bg scale_modifier viewmatrix projmatrix "
     "sh_degree campos prefiltered debug"
 )
 CALL = "means3D means2D opacities shs colors_precomp scales rotations cov3D_precomp"
 FORKS = {  # settings in addition to SETTINGS, parameters of the call, results
-    "inria 2023": ("", CALL, "color radii"),
-    "inria 2024": ("antialiasing", CALL, "color radii depth"),
-    "w-pose": ("projmatrix_raw", f"{CALL} theta rho", "color radii depth alpha touched"),
-    "mip-splatting": ("kernel_size subpixel_offset", CALL, "color depth alpha radii"),
-    "feature-3dgs": ("", CALL.replace("shs", "shs semantic_feature"), "color features radii depth"),
+    "inria": ("antialiasing", CALL, "color radii depth"),
+    "other": (
+        "kernel_size",
+        f"{CALL.replace('shs', 'shs semantic_feature')} theta rho",
+        "color features depth alpha radii touched",
+    ),
 }
 
 
-def module(name: str):
+def module(name: str, nearest: float = 0.2):
     """The module ``diff_gaussian_rasterization`` of this fork; its rasterizer notes the arguments
     in ``given``.
     """
@@ -48,7 +47,7 @@ def module(name: str):
         def forward(self, *args, **kwargs) -> tuple[Tensor, ...]:
             self.given = dict(zip(call.split(), args, strict=False)) | kwargs
             assert set(self.given) <= set(call.split())
-            drawn = _draw(self.raster_settings, self.given)
+            drawn = _draw(self.raster_settings, self.given, nearest)
             return tuple(drawn[result] for result in results.split())
 
     forward = GaussianRasterizer.forward
@@ -79,15 +78,15 @@ def settings_of(kind, view: Camera, **others):
     return kind(**{name: (values | others).get(name) for name in kind._fields})
 
 
-def _draw(settings, given: dict[str, Any]) -> dict[str, Any]:
-    """Every result of any fork; ``radii`` and ``touched`` have a row per Gaussian."""
+def _draw(settings, given: dict[str, Any], nearest: float) -> dict[str, Any]:
+    """Every result of either fork; ``radii`` and ``touched`` have a row per Gaussian."""
     width = settings.image_width
     height = settings.image_height
     fx = width / (2 * settings.tanfovx)
     fy = height / (2 * settings.tanfovy)
     K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
     depths = given["means3D"] @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
-    seen = depths > NEAREST
+    seen = depths > nearest
     result = {"radii": (99 * seen / depths).int(), "features": given.get("semantic_feature")}
     if given.get("scales") is None:
         return result | dict.fromkeys(("color", "alpha", "depth", "touched"))
@@ -108,9 +107,5 @@ def _draw(settings, given: dict[str, Any]) -> dict[str, Any]:
         background=settings.bg,
     )
     color = image.permute(2, 0, 1) + 0 * given["means2D"].sum()
-    return result | {
-        "color": color,
-        "alpha": alpha,
-        "depth": 2 * alpha,
-        "touched": 2 * result["radii"],
-    }
+    touched = 2 * result["radii"]
+    return result | {"color": color, "alpha": alpha, "depth": 2 * alpha, "touched": touched}

@@ -190,7 +190,7 @@ def draws(monkeypatch):
     ours = fresh_copy(
         monkeypatch, "gsplat", "gsplat", gsplat_versions.module("1.5.3")
     ).rasterization
-    fork = inria_forks.module("inria 2024")
+    fork = inria_forks.module("inria")
     inria = fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", fork)
     of_inria = inria.GaussianRasterizer(
         inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)

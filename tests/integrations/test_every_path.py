@@ -1,6 +1,6 @@
 """One adapted file looks the same through every path that draws it, and so do the files of
-viewers/kit; the wrapper against stand-ins for five forks of Inria's rasterizer, called with the
-kept rows alone.
+viewers/kit; the wrapper against stand-ins for Inria's rasterizer and a fork, called with the kept
+rows alone.
 """
 
 import json
@@ -59,7 +59,7 @@ def inria(monkeypatch, installed):
     return fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", installed)
 
 
-def arguments(g, fork="inria 2024"):
+def arguments(g, fork="inria"):
     """A fork's arguments by name, and those of the dial; floating-point tensors require
     gradients.
     """
@@ -84,9 +84,9 @@ def arguments(g, fork="inria 2024"):
 def through_inria(checkpoint, monkeypatch):
     g = checkpoint.gaussians
     name, settings = (
-        ("mip-splatting", {"kernel_size": 0.1})
+        ("other", {"kernel_size": 0.1})
         if g.screen_filter == FILTERS["mip"]
-        else ("inria 2024", {"antialiasing": g.screen_filter.compensate})
+        else ("inria", {"antialiasing": g.screen_filter.compensate})
     )
     ours = inria(monkeypatch, inria_forks.module(name))
     rasterizer = ours.GaussianRasterizer(
@@ -169,7 +169,7 @@ def test_the_kit_is_what_the_library_draws_and_writes(suffix, levels):
 def test_kept_rows_are_drawn_as_by_the_fork(name, monkeypatch):
     """Also called by position. Without sigma_d, results are the fork's."""
     fork, model = inria_forks.module(name), adapted(form="paper")
-    given = arguments(model if name != "w-pose" else model.replace(growth_d=None), name)
+    given = arguments(model if name == "inria" else model.replace(growth_d=None), name)
     dial = {
         key: given.pop(key)
         for key in ("sigma_d", "growth_d", "attenuation", "virtual_scale")
@@ -215,8 +215,7 @@ def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch):
     """From many positions, since rounding moves a point at the camera's centre in front of it or
     behind it.
     """
-    monkeypatch.setattr(inria_forks, "NEAREST", 0.0)
-    fork = inria_forks.module("inria 2024")
+    fork = inria_forks.module("inria", nearest=0.0)
     given, ours = (
         arguments(adapted().replace(sigma_d=torch.full((60,), 1e-3))),
         inria(monkeypatch, fork),
@@ -229,7 +228,7 @@ def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch):
 
 def test_covariances_grow_by_the_square(monkeypatch):
     """``cov3D_precomp`` instead of scales and rotations, by name and by position."""
-    fork, given = inria_forks.module("inria 2024"), arguments(adapted())
+    fork, given = inria_forks.module("inria"), arguments(adapted())
     ours = inria(monkeypatch, fork).GaussianRasterizer(
         settings_of(fork.GaussianRasterizationSettings, VIEW)
     )
@@ -252,7 +251,7 @@ def test_covariances_grow_by_the_square(monkeypatch):
 
 
 def test_bad_arguments_are_refused(monkeypatch):
-    fork, short = inria_forks.module("inria 2024"), torch.ones(59)
+    fork, short = inria_forks.module("inria"), torch.ones(59)
     for prefiltered, changed, message in (
         (True, {}, "prefiltered is True.*set it to False"),
         (
