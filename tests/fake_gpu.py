@@ -22,16 +22,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 MOVES = ("aten._to_copy.default", "aten.copy_.default")  # what may see tensors of both
-# Operations whose result, or its size, the host reads.
-READS = (
-    "_local_scalar_dense",
-    "nonzero",
-    "equal",
-    "masked_select",
-    "_unique2",
-    "unique_consecutive",
-    "unique_dim",
-)
+# of operations whose result, or its size, the host reads
+READS = {torch.Tag.data_dependent_output, torch.Tag.dynamic_output_shape}
 _log = []
 
 
@@ -95,9 +87,9 @@ def _waits(function, args, kwargs: dict[str, Any], walled: list[Any]) -> bool:
         return (to.type == "gpu") != bool(
             walled if name == MOVES[0] else isinstance(args[1], Walled)
         ) and not going_on
-    masks = args[1] if name.startswith("aten.index") and isinstance(args[1], (list, tuple)) else ()
-    masked = any(isinstance(rows, Walled) and rows.dtype == torch.bool for rows in masks)
-    return bool(walled) and (masked or name.split(".")[1] in READS)
+    if name.startswith("aten.index"):  # by masks alone
+        return any(each.dtype == torch.bool for each in walled[1:])
+    return bool(walled) and not READS.isdisjoint(function.tags)
 
 
 def _place() -> str:
