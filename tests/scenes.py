@@ -5,6 +5,7 @@ import re
 from functools import partial
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from clod_adapter import AttenuationConfig, Camera, Gaussians, Scene, View, render
@@ -24,17 +25,10 @@ def camera(
     """At (0.3, -0.2, -3), looking roughly along +z, principal point at ``off_centre`` shares of the
     image.
     """
-    yaw = 0.12
-    pitch = -0.07
-    ry = torch.tensor(
-        [[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]]
-    )
-    rx = torch.tensor(
-        [[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]]
-    )
+    rotation = torch.from_numpy(Rotation.from_euler("yx", [0.12, -0.07]).as_matrix()).float()
     viewmat = torch.eye(4)
-    viewmat[:3, :3] = rx @ ry
-    viewmat[:3, 3] = -(rx @ ry) @ torch.tensor([0.3, -0.2, -3.0])
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ torch.tensor([0.3, -0.2, -3.0])
     focal = 0.5 * width / math.tan(math.radians(fov) / 2)
     K = torch.tensor(
         [[focal, 0, width * off_centre[0]], [0, focal * 1.03, height * off_centre[1]], [0, 0, 1.0]]
