@@ -3,10 +3,9 @@ budgets.
 
     python benchmarks/stream.py SCENE.ply --record    # without photographs
     python benchmarks/stream.py SCENE.ply --images FOLDER --record    # with photographs
-    python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record    # its author's, too
 
-SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
-again and again by splat-transform (``make peers``) in both its ways, and the author's own.
+SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself, halved
+again and again by splat-transform (``make peers``) in both its ways.
 ``export --lod-meta`` of the adapted file is drawn too. A set is drawn by the rule of PlayCanvas
 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is that of the
 nearest point of its box; level b >= 1 begins at K multiplier^(b - 1); in each frame one K for all
@@ -26,7 +25,7 @@ from typing import NamedTuple
 
 import clod_adapter as clod
 from clod_adapter.losses import decibels
-from common import COMMAND, Process, Row, Table, append, arguments, last, percent, with_best
+from common import Row, Table, append, arguments, clod_adapt, last, percent, with_best
 from tuning import TIMEOUT, find_tool
 
 import numpy as np
@@ -48,7 +47,6 @@ SHOWN = {
     "lod-meta": "this file's levels, `export --lod-meta`",
     "halved": "halved uniformly",
     "halved adaptively": "halved adaptively",
-    "author": "its author's levels",
 }
 Files = dict[float, list[Path]]
 
@@ -57,26 +55,20 @@ def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--images", type=Path, help="photographs; without it there are none")
-    levels = {"nargs": "+", "type": Path, "default": []}
-    parser.add_argument("--author", **levels, help="coarser levels, the finest first")
-    parser.add_argument(
-        "--adapted", type=Path, help="the file of an earlier run, which is not run again"
-    )
     args = parser.parse_args()
     base = clod.load(args.scene).gaussians
     views = clod.load_scene(args.images).test if args.images else rendered(base)
     scene = args.images.name if args.images else args.scene.stem
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        out = args.adapted or folder / "adapted.ply"
-        if args.adapted is None:
-            words = ["--images", args.images] if args.images else []
-            run = Process([*COMMAND, args.scene, *words, "--out", out, "--json", "--accept-loss"])
-            row = {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
-            append(FILE, {"scene": scene, **row}, args.record)
+        out = folder / "adapted.ply"
+        words = ["--images", args.images] if args.images else []
+        run = clod_adapt(args.scene, *words, "--out", out, "--json", "--accept-loss")
+        row = {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
+        append(FILE, {"scene": scene, **row}, args.record)
         for row in of_dial(base, out, views):
             append(FILE, {"scene": scene, **row}, args.record)
-        for row in of_sets(base, sets_of(args.scene, args.author, out, folder), views):
+        for row in of_sets(base, sets_of(args.scene, out, folder), views):
             append(FILE, {"scene": scene, **row}, args.record)
 
 
@@ -91,13 +83,11 @@ def of_dial(base: clod.Gaussians, adapted: Path, views: Sequence[clod.View]) -> 
         yield {"method": "dial", **measured(Dial(dial), views, budget, len(base))}
 
 
-def sets_of(scene: Path, author: list[Path], adapted: Path, folder: Path) -> dict[str, Files]:
+def sets_of(scene: Path, adapted: Path, folder: Path) -> dict[str, Files]:
     """The levels of each set for each multiplier, the finest first."""
     sets = dict[str, Files]()
     for name, option in SETS.items():
         sets[name] = dict.fromkeys(MULTIPLIERS, [scene, *halved(scene, option, folder / name)])
-    if author:
-        sets["author"] = dict.fromkeys(MULTIPLIERS, [scene, *author])
     sets["lod-meta"] = {
         each: own_levels(adapted, each, folder / f"own{each:g}") for each in MULTIPLIERS
     }
@@ -246,9 +236,7 @@ def halved(scene: Path, option: str, folder: Path) -> list[Path]:
 
 def own_levels(adapted: Path, multiplier: float, folder: Path) -> list[Path]:
     """The levels of ``export --lod-meta``, as splat-transform reads them."""
-    Process(
-        [*COMMAND, "export", adapted, "--lod-meta", "--multiplier", multiplier, "--out", folder]
-    )
+    clod_adapt("export", adapted, "--lod-meta", "--multiplier", multiplier, "--out", folder)
     meta, files = folder / "lod-meta.json", list[Path]()
     for level in range(int(json.loads(meta.read_text("utf-8"))["lodLevels"])):
         files.append(folder / f"level{level}.ply")
