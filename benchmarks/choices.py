@@ -3,11 +3,10 @@ change at a time.
 
     python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full
     python benchmarks/choices.py demo --names SHARE full    # the folder of clod-adapt demo
-    python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER    # no photographs
 
-A scene is a folder of the shared data, one of the demo, or a file, whose placed cameras and renders
-are used. Each run adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice is
-a constant of ``training/far.py``, a field of ``schedule.FAR``, or a field of ``AdaptConfig``.
+A scene is a folder of the shared data, or one of the demo. Each run adds one row to
+``results/choices.jsonl``; "default" changes nothing. A choice is a constant of ``training/far.py``,
+a field of ``schedule.FAR``, or a field of ``AdaptConfig``.
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -20,7 +19,6 @@ from unittest.mock import patch
 import clod_adapter as clod
 from adapt import at_shares
 from clod_adapter.training import dial, far
-from clod_adapter.training.pseudo_views import with_pseudo_views
 from clod_adapter.training.schedule import FAR
 from common import (
     Table,
@@ -33,15 +31,11 @@ from common import (
     psnr_at,
     psnr_kept,
 )
-from stream import rendered
 
 FILE, MAX_SV = "choices.jsonl", 7.0  # of captures, as adapt.jsonl has them
 ALTERNATIVES: dict[str, tuple[Any, ...]] = {
     "SHARE": (0.4, 0.6),
     "NEARER": (0.3, 0.5),
-    "PLACED_SHARE": (0.8,),
-    "PLACED_NEARER": (0.2, 0.5),
-    "PLACED_CONTRAST": (1.0,),
     "LONGER": (1.0,),
     "full": (0.0, 0.5),
     "coarse": (0.0, 0.9),
@@ -89,17 +83,12 @@ def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
     demo = Path(scene) / "base.ply"
     if demo.exists():
         return clod.load(demo).gaussians, clod.load_scene(demo.with_name("capture"))
-    if not scene.endswith(".ply"):
-        return checkpoint(scene).gaussians, photographs(scene)
-    base = clod.load(scene).gaussians
-    return base, clod.Scene(with_pseudo_views(base, None).train, tuple(rendered(base)))
+    return checkpoint(scene).gaussians, photographs(scene)
 
 
 def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any) -> None:
     """Adapts with one change, and adds the row."""
     make = partial(clod.AdaptConfig, max_sv=MAX_SV)
-    if scene.endswith(".ply"):
-        make = partial(clod.AdaptConfig.placed)
     change: AbstractContextManager[Any] = nullcontext()
     if hasattr(far, name):
         change = patch.object(far, name, value)
