@@ -6,22 +6,19 @@ eight decades have a known sigma_d that meets the target-count curve; training s
 decades off and minimises the mean square difference of the drawn opacities from the right ones, and
 the count term, with the package's schedule and mean of the last steps. Every optimizer gets the
 same gradients, and RowAdam's epsilon, which is that of 3DGS.
-
-``stuck``: a quarter each begins at one of STARTS. A Gaussian is stuck if no dial value gives it a
-gradient.
 """
 
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
+from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.initialization.importance import WIDEST, extinction_from_rank
 from clod_adapter.report.charts import (
     BLUE,
@@ -49,7 +46,6 @@ RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades
 WRONG = 4.0  # decades, each way
 STEPS = 600
 LENGTHS = (30, 100, 300, 1000)
-STARTS = ("0", "1e4 times too small", "1e4 times too large", "SIGMA_MAX")
 CONVERGED = 0.25  # of the start's error
 Stepper = Callable[[list[Tensor], list[float]], None]
 
@@ -163,12 +159,8 @@ def fit(
     return list(means.exp() if log else means), time.perf_counter() - began
 
 
-def gradients(
-    task: Problem, x: Tensor, log: bool, dials: Sequence[int], count: bool = True
-) -> Tensor:
-    """``[runs, N]``: gradient by ``x`` of the loss at these dial values and, with ``count``, of the
-    count term.
-    """
+def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int]) -> Tensor:
+    """``[runs, N]``: gradient by ``x`` of the loss at these dial values and of the count term."""
     settings = CONFIG.attenuation(1.0)
     n = len(task.start)
     total = torch.zeros(())
@@ -182,25 +174,12 @@ def gradients(
         losses = (opacities.view(-1, n) - task.wanted[k]).square().mean(1)
         weight = (1 - Dial.weight_slope * s / CONFIG.max_sv) ** 2
         total = total + weight * losses.sum()
-        if count:
-            target = target_share(s, n, CONFIG)
-            runs = zip(sigma.detach().view(-1, n), (weight * losses.detach()).tolist(), strict=True)
-            for run, (values, loss) in enumerate(runs):
-                pull[run] += count_gradient(task.distances, values, s, loss, CONFIG, target)
+        target = target_share(s, n, CONFIG)
+        runs = zip(sigma.detach().view(-1, n), (weight * losses.detach()).tolist(), strict=True)
+        for run, (values, loss) in enumerate(runs):
+            pull[run] += count_gradient(task.distances, values, s, loss, CONFIG, target)
     (gradient,) = torch.autograd.grad(total, leaf)
     return gradient + (pull if log else pull / x.detach())
-
-
-def stuck(task: Problem, log: bool, count: bool) -> Tensor:
-    """``[N]`` bool, Gaussians that are drawn wrongly at first, and get no gradient at any dial
-    value.
-    """
-    x = task.parameter(log)[None]
-    slopes = [gradients(task, x.clone(), log, (k,), count)[0] for k in range(len(DIALS))]
-    moved = torch.stack(slopes).any(0)
-    opacities = drawn(task.logits, task.parameter(False), task.distances)
-    wrong = (opacities - task.wanted).abs().amax(0) > 0.01
-    return wrong & ~moved
 
 
 def measure() -> list[Row]:
@@ -219,14 +198,6 @@ def measure() -> list[Row]:
             cost = {"error": task.error(sigma), "seconds": seconds}
             rows.append(about | {"rate": best, "steps": steps} | cost)
     rows.append({"what": "start", "error": task.error(task.start)})
-    kind = torch.arange(len(task.right)) % len(STARTS)
-    right = task.right
-    ends = torch.stack([right * 0, right / 1e4, right * 1e4, torch.full_like(right, SIGMA_MAX)])
-    bad = replace(task, start=ends.gather(0, kind[None])[0])
-    for log, count in ((False, False), (True, False), (True, True)):
-        name = f"{'log' if log else 'linear'} sigma_d{', count term (default)' if count else ''}"
-        counts = kind[stuck(bad, log, count)].bincount(minlength=len(STARTS)).tolist()
-        rows.append({"what": "stuck", "method": name, "of": len(kind), "counts": counts})
     return rows
 
 
