@@ -6,9 +6,8 @@ each.
     python benchmarks/faults.py --check             # whether each still applies, without a run
 
 A fault is one replaced text in one file: ``name``, ``file``, ``before`` (occurs once), ``after``,
-and ``tests``, the paths that run. With ``--whole`` the whole suite runs where these pass, minutes
-each. The exit code is 1 where a fault was not caught, and, before any run, where a ``before`` does
-not occur once.
+and ``tests``, the paths that run. The exit code is 1 where a fault was not caught, and, before any
+run, where a ``before`` does not occur once.
 """
 
 import os
@@ -66,14 +65,13 @@ def first_failure(copy: Path, tests: Sequence[str]) -> tuple[str, str]:
     return next(failed, lines[-1]) if done.returncode else "", lines[-1]
 
 
-def run(copy: Path, entry: Row, whole: bool) -> tuple[str, str]:
+def run(copy: Path, entry: Row) -> tuple[str, str]:
     """What catches the fault, and the counts, as by ``first_failure``."""
     path = copy / entry["file"]
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(entry["before"], entry["after"]), encoding="utf-8")
     try:
-        by, counts = first_failure(copy, entry["tests"])
-        return first_failure(copy, ["tests"]) if whole and not by else (by, counts)
+        return first_failure(copy, entry["tests"])
     finally:
         path.write_text(text, encoding="utf-8")
 
@@ -81,9 +79,6 @@ def run(copy: Path, entry: Row, whole: bool) -> tuple[str, str]:
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("faults", nargs="*", help="ROOM or ROOM/NAME; default: all")
-    parser.add_argument(
-        "--whole", action="store_true", help="run the whole suite where the fault's own tests pass"
-    )
     parser.add_argument("--check", action="store_true", help="only check that each fault applies")
     args = parser.parse_args()
     if (wrong := misfits(args.faults)) or args.check:
@@ -96,7 +91,7 @@ def main() -> None:
         (copy / "clod_adapter" / "cli").symlink_to(copy / "cli")
         for name, entry in faults(args.faults):
             began = time.perf_counter()
-            by, counts = run(copy, entry, args.whole)
+            by, counts = run(copy, entry)
             missed += not by
             print(f"{name:40} {by or f'NOT CAUGHT ({counts})'}", flush=True)
             if args.record:
