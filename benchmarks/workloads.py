@@ -7,7 +7,7 @@ compares.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from clod_adapter.cameras import Camera
@@ -52,10 +52,6 @@ class Workload:
             "sh0": self.sh[:, :1].contiguous(),
             "shN": self.sh[:, 1:].contiguous(),
         }
-
-    def at(self, rows: Tensor) -> Workload:
-        """Those rows."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in FIELDS})
 
 
 def make(size: Size) -> Workload:
