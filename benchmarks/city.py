@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 import clod_adapter as clod
+from clod_adapter.cameras import intrinsics
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
 from models import write_photographs
@@ -131,10 +132,8 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     focal = width / 2 / math.tan(math.radians(65) / 2)
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return clod.Camera(
-        torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name
-    )
+    K = intrinsics(focal, focal, width / 2, height / 2)
+    return clod.Camera(torch.from_numpy(viewmat).float(), K, width, height, name)
 
 
 def perturb(truth: Gaussians) -> Gaussians:

@@ -12,6 +12,7 @@ import json
 import math
 
 import clod_adapter as clod
+from clod_adapter.cameras import intrinsics
 from common import ROOT, Row, arguments
 
 import torch
@@ -49,7 +50,7 @@ def resized(camera: clod.Camera) -> clod.Camera:
     """
     height = round(camera.height * WIDTH / camera.width)
     focal = float(camera.K[0, 0]) * WIDTH / camera.width
-    K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, height / 2], [0, 0, 1]])
+    K = intrinsics(focal, focal, WIDTH / 2, height / 2)
     return clod.Camera(camera.viewmat, K, WIDTH, height)
 
 

@@ -13,6 +13,7 @@ from itertools import product
 
 import clod_adapter as clod
 from city import look_at
+from clod_adapter.cameras import intrinsics
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import normalized_distances
@@ -103,7 +104,7 @@ def scene(form: str, others: int = OTHERS) -> tuple[Gaussians, dict[str, list[cl
 
 def _looking(eye: Tensor, at: Tensor) -> clod.Camera:
     camera = look_at(eye.double().numpy(), at.double().numpy(), WIDTH, HEIGHT, "")
-    K = torch.tensor([[1.1 * WIDTH, 0, WIDTH / 2], [0, 1.1 * WIDTH, HEIGHT / 2], [0, 0, 1.0]])
+    K = intrinsics(1.1 * WIDTH, 1.1 * WIDTH, WIDTH / 2, HEIGHT / 2)
     return replace(camera, K=K)
 
 

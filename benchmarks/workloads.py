@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from clod_adapter.cameras import Camera
+from clod_adapter.cameras import Camera, intrinsics
 from clod_adapter.gaussians import SH_C0
 
 import numpy as np
@@ -67,10 +67,10 @@ def make(size: Size) -> Workload:
     sh = _colors(draw, points)
     weights = draw.normal(size=(height, width, 3)) / (height * width) * 100
     viewmat = np.block([[rotation, translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    K = intrinsics(focal, focal, width / 2, height / 2)
     return Workload(
         *map(_tensor, (points, quats, pixels * depths[:, None] / focal, opacities, sh)),
-        Camera(_tensor(viewmat), _tensor(K), width, height),
+        Camera(_tensor(viewmat), K, width, height),
         _tensor(weights),
     )
 

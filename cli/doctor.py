@@ -77,7 +77,7 @@ def rendered(device: str, name: str, fix: str) -> Found:
     """Renders sixty Gaussians and compares the image with the reference rasterizer's."""
     import torch
 
-    from clod_adapter.cameras import Camera
+    from clod_adapter.cameras import Camera, intrinsics
     from clod_adapter.rasterizers import for_device, reference
 
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(7))
@@ -90,7 +90,7 @@ def rendered(device: str, name: str, fix: str) -> Found:
         "shN": 0.1 * normal(60, 3, 3),
         "background": torch.zeros(3),
     }
-    camera = Camera(torch.eye(4), torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)
+    camera = Camera(torch.eye(4), intrinsics(60.0, 60, 32, 24), 64, 48)
     want, _ = reference.rasterize(**scene, camera=camera)
     splat = for_device(torch.device(device)).splat
     image, _ = splat(**{name: value.to(device) for name, value in scene.items()}, camera=camera)

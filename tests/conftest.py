@@ -3,6 +3,7 @@
 # Before anything imports torch, whose idle threads would else spin and take the cores from the
 # kernels.
 import clod_adapter  # noqa: F401
+from clod_adapter.cameras import intrinsics
 
 # isort: split
 import math
@@ -131,4 +132,4 @@ def _write_inria(path, gaussians):
 def _camera(angle):
     viewmat = looking(-torch.tensor([math.sin(angle), 0.1, math.cos(angle)]))
     viewmat[:3, 3] = torch.tensor([0.0, 0.0, 5.0])
-    return Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)
+    return Camera(viewmat, intrinsics(60.0, 60, 32, 24), 64, 48)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from clod_adapter import Camera, ScreenFilter
+from clod_adapter.cameras import intrinsics
 from clod_adapter.rasterizers.cpu import rasterize
 
 SETTINGS = (
@@ -84,7 +85,7 @@ def _draw(settings, given: dict[str, Any], nearest: float) -> dict[str, Any]:
     height = settings.image_height
     fx = width / (2 * settings.tanfovx)
     fy = height / (2 * settings.tanfovy)
-    K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
+    K = intrinsics(fx, fy, width / 2, height / 2)
     depths = given["means3D"] @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
     seen = depths > nearest
     result = {"radii": (99 * seen / depths).int(), "features": given.get("semantic_feature")}

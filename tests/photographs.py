@@ -10,7 +10,7 @@ import pycolmap
 import torch
 from PIL import Image
 
-from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.cameras import Camera, Scene, View, intrinsics
 from models import write_model
 
 SIZE = {"width": 160, "height": 120}
@@ -36,7 +36,7 @@ def pose(seed: int) -> torch.Tensor:
 
 
 def camera(seed: int, width: int = 40, height: int = 30, focal: float = 35.5) -> Camera:
-    K = torch.tensor([[focal, 0, 19.25], [0, focal + 1, 15.5], [0, 0, 1]])
+    K = intrinsics(focal, focal + 1, 19.25, 15.5)
     return Camera(pose(seed), K, width, height)
 
 

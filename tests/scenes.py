@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from clod_adapter import AttenuationConfig, Camera, Gaussians, Scene, View, render
+from clod_adapter.cameras import intrinsics
 
 
 def seeded(seed: int) -> torch.Generator:
@@ -30,9 +31,7 @@ def camera(
     viewmat[:3, :3] = rotation
     viewmat[:3, 3] = -rotation @ torch.tensor([0.3, -0.2, -3.0])
     focal = 0.5 * width / math.tan(math.radians(fov) / 2)
-    K = torch.tensor(
-        [[focal, 0, width * off_centre[0]], [0, focal * 1.03, height * off_centre[1]], [0, 0, 1.0]]
-    )
+    K = intrinsics(focal, focal * 1.03, width * off_centre[0], height * off_centre[1])
     return Camera(viewmat, K, width, height)
 
 
@@ -91,7 +90,7 @@ def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Ca
         eye = radius * (1 + 0.1 * math.cos(3 * turn)) * eye
         viewmat = looking(-eye)
         viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-        K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
+        K = intrinsics(1.1 * width, 1.1 * width, width / 2, height / 2)
         cameras.append(Camera(viewmat, K, width, height, f"view_{k}.png"))
     return cameras
 

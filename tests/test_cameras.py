@@ -7,9 +7,10 @@ import torch
 from refusals import refused
 
 from clod_adapter import Camera
+from clod_adapter.cameras import intrinsics
 
 VIEWMAT = torch.eye(4)
-K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+K = intrinsics(60.0, 60, 32, 24)
 
 
 def changed(matrix, row, column, value):

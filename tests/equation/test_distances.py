@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clod_adapter import AttenuationConfig, Camera, with_dial
+from clod_adapter.cameras import intrinsics
 from clod_adapter.config import FORMS
 from clod_adapter.equation import units
 from clod_adapter.equation.attenuation import SIGMA_MAX, dial
@@ -55,9 +56,7 @@ def test_distances_are_divided_by_the_unit_of_the_form():
     """At depth 1 of this camera at z = -2 the image is x in [-0.5, 0.5) and y in [-0.4, 0.4)."""
     viewmat = torch.eye(4)
     viewmat[2, 3] = 2.0
-    camera = Camera(
-        viewmat, torch.tensor([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]]), width=100, height=80
-    )
+    camera = Camera(viewmat, intrinsics(100.0, 100, 50, 40), width=100, height=80)
     # Along the axis at distances 1..10, then one behind the camera, one outside the image, one too
     # near.
     axis = torch.tensor([[0.0, 0.0, z - 2.0] for z in range(1, 11)])

@@ -18,6 +18,7 @@ import gsplat_in_torch
 import inria_forks
 import scenes
 from backends import fresh_copy
+from clod_adapter.cameras import intrinsics
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.rasterizers import Rasterizer, reference
@@ -154,7 +155,7 @@ def test_the_kit_is_what_the_library_draws_and_writes(suffix, levels):
     gaussians = clod.load(KIT / f"kit.{suffix}").gaussians
     for about in json.loads((KIT / "cameras.json").read_text(encoding="utf-8"))["cameras"]:
         width, height, focal = about["width"], about["height"], about["focal"]
-        K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        K = intrinsics(focal, focal, width / 2, height / 2)
         camera = clod.Camera(torch.tensor(about["world_to_camera"]), K, width, height)
         for frame in about["frames"]:
             shown = clod.render(gaussians, camera, frame["s"])

@@ -19,6 +19,7 @@ from refusals import refused
 from torch.testing import assert_close
 
 from clod_adapter._support.text import file_name
+from clod_adapter.cameras import intrinsics
 from clod_adapter.io.scene.folder import UNUSED, scene_files
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from formats import examples
@@ -88,7 +89,7 @@ def test_blender_files(tmp_path):
     ]
     assert names_of(loaded.test) == ["test/r_0.png", "test/r_1.png"]
     assert loaded.notes == ("held out are the photographs of transforms_test.json",)
-    assert_close(loaded.train[0].camera.K, torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]))
+    assert_close(loaded.train[0].camera.K, intrinsics(50.0, 50, 20, 15))
     (tmp_path / "transforms_test.json").unlink()
     loaded = load_scene(tmp_path)
     assert (names_of(loaded.test), len(loaded.train)) == (["train/r_0.png"], 2)

@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from clod_adapter.cameras import Camera
+from clod_adapter.cameras import Camera, intrinsics
 from clod_adapter.config import FILTERS, ScreenFilter
 from oracle import BACKGROUND, IMAGE, ON_A_CUT, assert_agrees
 from scenes import camera, in_front, scene
@@ -133,7 +133,7 @@ def test_an_ellipse_beyond_the_range_of_integers(rasterize):
     range.
     """
     far = 1e8
-    view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]]), 128, 128)
+    view = Camera(torch.eye(4), intrinsics(100.0, 100.0, 64, 64), 128, 128)
     some = scene(20, 0, 0)
     some["means"][:, 2] += 4
     some["means"][7] = torch.tensor([far, 0.0, 0.01])

@@ -10,6 +10,7 @@ import torch
 from torch.testing import assert_close
 
 from clod_adapter import View
+from clod_adapter.cameras import intrinsics
 from clod_adapter.config import AdaptConfig
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.schedule import OURS, PAPER, Schedule, ViewSampler
@@ -62,7 +63,7 @@ def test_dial_values_follow_the_schedule():
 )
 def test_first_steps_have_photographs_of_half_the_size(height, share_done, full, halved):
     """Unless these would be small, or the step is at s = 1."""
-    K = torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]])
+    K = intrinsics(90.0, 90, 150, 129)
     camera = replace(VIEWS[0].camera, width=301, height=height, K=K)
     view = View(camera, torch.randint(256, (height, 301, 3), generator=seeded(0)).byte())
     schedule = Schedule(coarse=0.5, full=full)
