@@ -1,7 +1,6 @@
 """The plan: its measurements on scenes with known results, its decisions, and training with it."""
 
 import json
-import math
 import re
 from statistics import fmean
 
@@ -12,10 +11,9 @@ from refusals import refused
 from clod_adapter import AdaptConfig, Decision, Override, Scene, make_plan, render
 from clod_adapter.adapter import detach
 from clod_adapter.initialization.importance import removal_error
-from clod_adapter.training.far import supposed_error
 from clod_adapter.training.plan import NAMES, NOT_NEEDED
 from runs import states_of
-from scenes import assert_equal, gaussians, photograph, ring
+from scenes import assert_equal, photograph
 
 CONFIG = AdaptConfig(iters=20, max_sv=4.0, start_share=0.62)
 ALL = frozenset(NAMES)
@@ -95,18 +93,3 @@ def test_a_resumed_plan_gives_the_same_bits(visible):
     assert_equal(detach(resumed), base)
     assert torch.equal(resumed.means, plan.start.means)
     assert not torch.equal(resumed.quats, plan.start.quats)
-
-
-def test_what_no_placed_camera_shows_is_supposed_to_matter():
-    """As much as shown Gaussians of its opacity and size; what is opaque all over has no
-    derivative, and is shown.
-    """
-    base = gaussians(200, 0, 0, size=0.1)
-    base.means[:20] += torch.tensor([0.0, 80.0, 0.0])
-    error = removal_error(base, photograph(base, ring(6, 40, 30)))
-    error[30], base.opacity_logits[30] = 0.0, math.inf
-    found = supposed_error(base, error)
-    assert (error[:20] == 0).all()
-    assert (found[:20] > 0).all()
-    assert torch.equal(found[20:][error[20:] > 0], error[error > 0])
-    assert found[30] == 0 and 0.1 < found[:20].median() / found[20:].median() < 10
