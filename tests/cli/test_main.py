@@ -105,18 +105,6 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_bar_fits_the_terminal(monkeypatch):
-    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
-    monkeypatch.setattr("tqdm.std._screen_shape_wrapper", lambda: lambda file: (30, 24))
-    with Console().meter("training") as meter:
-        meter.bar.delay = meter.bar.mininterval = 0
-        for step in range(1, 5):
-            meter.update(step / 4, f"{step}/4, s=1 25.81 dB 100%, s=5 21.02 dB 9%")
-    lines = terminal.getvalue().split("\r")
-    assert any("50%" in line for line in lines) and max(map(len, lines)) <= 30
-    assert "\n" not in terminal.getvalue() and not lines[-1].strip()  # cleared at the end
-
-
 def test_progress_lines_without_a_terminal(capsys, monkeypatch):
     now = 0.0
     clock = SimpleNamespace(perf_counter=lambda: now)
