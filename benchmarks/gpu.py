@@ -7,35 +7,25 @@
 ``tests``: the contract of every backend, the gsplat integration and the optimizer.
 ``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and
 held-out quality.
-``city``: a synthetic city adapted (peak memory), then near and far frames in turn with plain gsplat
-on the same file: times, the dial's share, PSNR.
+``city``: a synthetic city adapted (peak memory), then near and far frames, in turn with those of
+the same file without its dial: times and PSNR.
 
-Each adds rows to ``results/gpu.jsonl``. Without a GPU, plain is this package's CPU rasterizer
-without the dial.
+Each adds rows to ``results/gpu.jsonl``.
 """
 
-import os
 import resource
-import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from statistics import fmean, median
-from typing import Any
 
 import clod_adapter as clod
+import portability
 from city import city, city_cameras, perturb
-from clod_adapter.equation.attenuation import dial
-from clod_adapter.losses import psnr
+from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.rasterizers import cuda, wait_for
-from clod_adapter.render import splat
-from common import ROOT, Row, append, arguments, checkpoint, outcomes, photographs, quality
+from common import Row, append, arguments, checkpoint, photographs, quality
 
 import torch
-from torch import Tensor
 
 DIALS = (1.0, 3.0, 7.0)
 TESTS = (
@@ -56,10 +46,9 @@ class Size:
     views: int = 24  # to train on, and as many to test
     steps: int = 300  # of the city's adaptation
     plush_steps: int | None = None  # of plush_half's; None: the default
-    repeats: int = 30  # of each timed frame
 
 
-SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3, repeats=2)
+SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3)
 
 
 def main() -> None:
@@ -88,22 +77,8 @@ def main() -> None:
 
 
 def run_tests(device: torch.device, size: Size, small: bool) -> list[Row]:
-    """Counts of all, failed and skipped tests, and the names of failed ones."""
-    few = ["-k", "test_for_device or test_no_gaussians"] if small else []
-    began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as folder:
-        report = Path(folder) / "report.xml"
-        options = ["-p", "no:xdist", "-q", f"--junitxml={report}"]
-        subprocess.run(
-            [sys.executable, "-m", "pytest", *options, *TESTS, *few],
-            cwd=ROOT,
-            stdout=sys.stderr,
-            check=False,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )
-        counts = outcomes(report)
-    cases = counts.pop("passed") + counts["failed"] + counts["skipped"]
-    return [{"cases": cases, **counts, "seconds": round(time.perf_counter() - began, 1)}]
+    """Counts of passed, failed and skipped tests, and the names of failed ones."""
+    return [portability.run("plain", TESTS[-1:] if small else TESTS)]
 
 
 def adapt_plush(device: torch.device, size: Size, small: bool) -> list[Row]:
@@ -163,78 +138,26 @@ def measure_city(device: torch.device, size: Size, small: bool) -> list[Row]:
     for where in ("near", "far"):
         cameras = city_cameras(4, size.width, size.height, where=where, count=size.count, seed=9)
         targets = photograph(truth, cameras, device)
-        rows += [frames(model, targets, where, s, size.repeats) for s in DIALS]
+        rows += frames(model, targets, where)
     return rows
 
 
-@torch.no_grad()
-def frames(
-    model: clod.Gaussians, views: list[clod.View], where: str, s: float, repeats: int
-) -> Row:
-    """Medians in milliseconds, ours and plain in turn, over the views; and PSNR of the pictures."""
-    device = model.means.device
-    plain = plain_frame(model)
-    jobs: dict[str, Callable[[clod.Camera], Any]] = {
-        "ours": lambda camera: clod.render(model, camera, s).image,
-        "plain": plain,
-        "dial": lambda camera: dial(model, camera, s),
-    }
-    times: dict[str, list[float]] = {name: [] for name in jobs}
-    for job in jobs.values():
-        job(views[0].camera)  # compiled and warm
-    for k in range(repeats):
-        camera = views[k % len(views)].camera
-        for name, job in jobs.items():
-            wait_for(device)
-            began = time.perf_counter()
-            job(camera)
-            wait_for(device)
-            times[name].append((time.perf_counter() - began) * 1e3)
-    ms = {name: median(taken) for name, taken in times.items()}
-    kept, psnr_full, psnr_truth = [], [], []
-    for view in views:
-        frame = clod.render(model, view.camera, s)
-        full = (plain(view.camera).clamp(0, 1) * 255).round().to(torch.uint8).cpu()
-        kept.append(int(frame.kept.sum()))
-        psnr_full.append(psnr(frame.image, full))
-        psnr_truth.append(psnr(frame.image, view.image))
-    return {
-        "what": "frames",
-        "where": where,
-        "virtual_scale": s,
-        "kept": fmean(kept),
-        "ms": ms,
-        "faster": {"plain": ms["plain"] / ms["ours"]},
-        "dial_share": ms["dial"] / ms["ours"],
-        "psnr_full": fmean(psnr_full),
-        "psnr_truth": fmean(psnr_truth),
-    }
-
-
-def plain_frame(model: clod.Gaussians) -> Callable[[clod.Camera], Tensor]:
-    """The file without its dial, activated beforehand, as a viewer that does not know the dial
-    draws it.
+def frames(model: clod.Gaussians, views: list[clod.View], where: str) -> list[Row]:
+    """Milliseconds of the dial values and of the file without its dial, in turn over the views; and
+    PSNR of the pictures, against the truth and against that file.
     """
-    scales, opacities = model.scales, model.opacities
-    if model.means.device.type == "cpu":
-        return lambda camera: splat(model, opacities, camera)[0]
-    import gsplat
-
-    colors = torch.cat([model.sh0, model.shN], 1)
-
-    return lambda camera: gsplat.rasterization(
-        model.means,
-        model.quats,
-        scales,
-        opacities,
-        colors,
-        camera.viewmat.to(scales)[None],
-        camera.K.to(scales)[None],
-        camera.width,
-        camera.height,
-        near_plane=camera.near,
-        sh_degree=model.sh_degree,
-    )[0][0]
+    plain = clod.detach(model)
+    cameras = [view.camera for view in views]
+    taken = time_frames([(model, DIALS), (plain, (1.0,))], cameras)
+    times, (without,) = taken.milliseconds
+    full = photograph(plain, cameras, model.means.device)
+    measured = zip(times, quality(model, views, DIALS), quality(model, full, DIALS), strict=True)
+    rows = []
+    for ms, row, of_full in measured:
+        milliseconds = {"ours": ms, "plain": without}
+        row |= {"what": "frames", "where": where, "ms": milliseconds, "psnr_full": of_full["psnr"]}
+        rows.append(row)
+    return rows
 
 
 def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Scene]:
