@@ -16,7 +16,7 @@ Each adds rows to ``results/gpu.jsonl``.
 import resource
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 
 import clod_adapter as clod
 import portability
@@ -48,7 +48,7 @@ class Size:
     plush_steps: int | None = None  # of plush_half's; None: the default
 
 
-SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3)
+SMALL = Size(count=1000, width=64, height=48, views=4, steps=3, plush_steps=3)
 
 
 def main() -> None:
@@ -60,7 +60,6 @@ def main() -> None:
         help="a tiny city, also in place of plush_half, and few tests",
     )
     parser.add_argument("--only", nargs="+", choices=CHECKS, default=list(CHECKS))
-    parser.add_argument("--count", type=int, help="Gaussians of the city")
     parser.add_argument("--results", default="gpu.jsonl", help="the file, in results/ or anywhere")
     args = parser.parse_args()
     if args.device == "cuda":
@@ -69,7 +68,6 @@ def main() -> None:
         if reason := cuda.unusable():
             sys.exit(reason)
     size = SMALL if args.small else Size()
-    size = replace(size, count=args.count or size.count)
     for name in args.only:
         about = {"benchmark": f"gpu {name}", "device": args.device, "size": asdict(size)}
         for row in CHECKS[name](torch.device(args.device), size, args.small):

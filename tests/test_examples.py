@@ -196,7 +196,7 @@ def test_an_exponent_is_that_of_the_power():
 
 def test_plush_and_city_small(monkeypatch, tmp_path):
     out = tmp_path / "gpu.jsonl"
-    words = f"gpu.py --device cpu --small --only plush city --count 1000 --results {out}"
+    words = f"gpu.py --device cpu --small --only plush city --results {out}"
     monkeypatch.setattr(sys, "argv", words.split())
     gpu.main()
     plush, adapted, *frames = map(json.loads, out.read_text("utf-8").splitlines())
