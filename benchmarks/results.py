@@ -155,20 +155,11 @@ def main() -> int:
 
 
 def list_all() -> int:
-    """Prints every task, and the tables that no page can have, or has, between marks."""
+    """Prints every task."""
     print(*map(listed, tasks()), sep="\n")
     for target, long in (("results", False), ("results-long", True)):
         minutes = sum(task.minutes for task in chosen([], long))
         print(f"make {target}: {minutes} minutes on two cores")
-    pages = "".join(page.read_text("utf-8") for page in PAGES)
-    for name, make in TABLES.items():
-        found = origins(make().rows)
-        if not found:
-            print(f"table {name}: no rows: run {name}")
-        elif len(found) > 1:
-            print(f"table {name}: rows of several commits: run {name}")
-        elif f"<!-- table: {name} -->" not in pages:
-            print(f"table {name}: rows of one commit; no page has its marks")
     return 0
 
 
