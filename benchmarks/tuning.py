@@ -22,7 +22,6 @@ from common import CACHE, ROOT
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
 from torch import Tensor
 from tqdm import tqdm
 
@@ -140,22 +139,11 @@ def merge(
     if not (out.exists() and clock.exists()):
         # In a folder of its own: another benchmark may want the same file now.
         with tempfile.TemporaryDirectory(dir=CACHE) as folder:
-            source, merged = Path(folder) / "base.ply", Path(folder) / "merged.ply"
-            _write_plain(source, base)
+            merged = Path(folder) / "merged.ply"
             try:
-                seconds = tool.run("-q", source, method, str(count), merged, timeout=TIMEOUT)
+                seconds = tool.run("-q", base.path, method, str(count), merged, timeout=TIMEOUT)
             except clod.ClodError as error:
                 sys.exit(str(error))
             clock.write_text(f"{seconds:.2f}\n", encoding="utf-8")
             merged.replace(out)
     return clod.load(out).gaussians, float(clock.read_text(encoding="utf-8"))
-
-
-def _write_plain(path: Path, base: clod.Checkpoint) -> None:
-    """The rows that the reader used, without MaskGaussian's columns, whose averages would mean
-    nothing.
-    """
-    names = [name for name in base.vertex.dtype.names if not name.startswith("masks_")]
-    # a view keeps the gaps
-    plain = base.vertex[names].astype([(name, base.vertex.dtype[name]) for name in names])
-    PlyData([PlyElement.describe(plain, "vertex")]).write(path)
