@@ -19,7 +19,7 @@ from typing import Any
 import clod_adapter as clod
 from clod_adapter.cameras import Scene, View, in_its_unit
 from clod_adapter.training.pseudo_views import add_pseudo_views
-from common import Row, Table, capture, checkpoint, photographs
+from common import Row, Table, capture, checkpoint, photographs, quality
 
 import numpy as np
 import pycolmap
@@ -214,19 +214,16 @@ def run(name: str, case: Case) -> Row:
     result = clod.extract(case.base, adapted.gaussians, fingerprint="", config={}).apply(case.base)
     dials = sorted({1.0, config.max_sv**0.5, config.max_sv})
     views = case.scene.test
-    (base_row,) = clod.evaluate(case.base, views, 1.0)
+    (base_row,) = quality(case.base, views, 1.0)
     pictures = (clod.render(result, views[0].camera, s).image for s in dials)
     finite = all(bool(x.isfinite().all()) for x in (*pictures, *result.tensors().values()))
-    rows = [
-        {"virtual_scale": row.virtual_scale, "psnr": row.psnr, "kept_share": row.kept_share}
-        for row in clod.evaluate(result, views, dials)
-    ]
+    rows = quality(result, views, dials)
     return {
         "case": name,
         "finite": finite,
-        "base_psnr": base_row.psnr,
+        "base_psnr": base_row["psnr"],
         "rows": rows,
-        "holds": finite and rows[0]["psnr"] >= base_row.psnr - ALLOWED,
+        "holds": finite and rows[0]["psnr"] >= base_row["psnr"] - ALLOWED,
         "seconds": round(seconds, 1),
     }
 
