@@ -1,6 +1,6 @@
 """Quality, count and seconds of adapted checkpoints, by dial value.
 
-    python benchmarks/adapt.py plush_half --set max_sv=20.0 --label "max_sv 20" --seeds 0 1 2
+    python benchmarks/adapt.py plush_half --set max_sv=20.0 --label "max_sv 20"
 
 A scene is a folder of the shared data, followed by the name of the checkpoint where it is not
 ``pretrained``. Each run adds one row to ``results/adapt.jsonl``: settings, commit, machine, the
@@ -38,13 +38,11 @@ def main() -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig"
     )
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--label", default="default", help="name of the row")
     args = parser.parse_args()
     changed = dict(_setting(text) for text in args.set)
     for scene in args.scenes:
-        for seed in args.seeds:
-            run(scene, args.label, clod.AdaptConfig(**{"seed": seed, **changed}), changed)
+        run(scene, args.label, clod.AdaptConfig(**changed), changed)
 
 
 def _setting(text: str) -> tuple[str, Any]:

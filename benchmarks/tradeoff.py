@@ -14,6 +14,7 @@ tuned with random prefixes, of which the same counts are measured. Each run adds
 import time
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 
 import clod_adapter as clod
 from clod_adapter.report.charts import draw_training, new_figure, save_figure
@@ -35,31 +36,15 @@ LABELS = {
 def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("scene", help="a folder of the shared data")
-    parser.add_argument("--iters", nargs="+", type=int, default=list(ITERS))
-    parser.add_argument(
-        "--only", nargs="+", choices=LABELS, default=list(LABELS), help="some of the methods"
-    )
     parser.add_argument("--plot", action="store_true", help="only draw the stored rows")
     args = parser.parse_args()
     if not args.plot:
         base, views = checkpoint(args.scene), photographs(args.scene)
         (untouched,) = quality(base.gaussians, views.test, 1.0)
-        for method in args.only:
-            for iters in args.iters:
-                seconds, rows = METHODS[method](args.scene, base, views, iters)
-                append(
-                    FILE,
-                    {
-                        "scene": args.scene,
-                        "method": method,
-                        "iters": iters,
-                        "seed": 0,
-                        "max_sv": MAX_SV,
-                        "seconds": seconds,
-                        "base": untouched,
-                        "rows": rows,
-                    },
-                )
+        for method, iters in product(LABELS, ITERS):
+            about = {"scene": args.scene, "method": method, "iters": iters, "max_sv": MAX_SV}
+            seconds, rows = METHODS[method](args.scene, base, views, iters)
+            append(FILE, {**about, "seconds": seconds, "base": untouched, "rows": rows})
     plot(args.scene)
 
 

@@ -40,12 +40,7 @@ BANDS = {"within 12 m": 12.0, "12 to 40 m": 40.0, "40 to 120 m": 120.0, "beyond"
 
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
-    parser.add_argument(
-        "--count", type=int, default=COUNT, help=f"Gaussians of the town (default: {COUNT})"
-    )
-    args = parser.parse_args()
-    row = measure(args.count)
-    append(FILE, row, args.record)
+    append(FILE, measure(COUNT), parser.parse_args().record)
 
 
 def measure(count: int) -> Row:
