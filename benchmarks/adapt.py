@@ -54,32 +54,28 @@ def _setting(text: str) -> tuple[str, Any]:
 
 
 def run(scene: str, label: str, config: clod.AdaptConfig, changed: Row) -> None:
-    base, views = checkpoint(scene), photographs(scene)
+    base, views = checkpoint(scene).gaussians, photographs(scene)
+    about = {"scene": scene, "label": label, "changed": changed, "base_count": len(base)}
+    (base_row,) = quality(base, views.test, 1.0)
+    append(FILE, {**about, "base": base_row, **adapted(base, views, views.test, config)})
+
+
+def adapted(
+    base: clod.Gaussians, views: clod.Scene, shown: Sequence[clod.View], config: clod.AdaptConfig
+) -> Row:
+    """Adapts to ``views``, and measures on the views ``shown``."""
     dials = sorted({s for s in DIALS if s < config.max_sv} | {config.max_sv})
-    (base_row,) = quality(base.gaussians, views.test, 1.0)
-    plan = clod.make_plan(base.gaussians, views, config)
-    adapted = plan.adapt(views)
-    adapter = clod.extract(
-        base.gaussians, adapted.gaussians, fingerprint=base.fingerprint, config=asdict(config)
-    )
-    result = adapter.apply(base.gaussians)
-    append(
-        FILE,
-        {
-            "scene": scene,
-            "label": label,
-            "changed": changed,
-            "config": asdict(config),
-            "base_count": len(base.gaussians),
-            "base": base_row,
-            "rows": quality(result, views.test, dials),
-            "at_shares": at_shares(result, views.test),
-            "steps": adapted.steps,
-            "share": plan.config.share,
-            "start_seconds": round(plan.seconds["bands"] + adapted.start_seconds, 2),
-            "train_seconds": round(adapted.seconds, 2),
-        },
-    )
+    plan = clod.make_plan(base, views, config)
+    result = plan.adapt(views)
+    return {
+        "config": asdict(config),
+        "rows": quality(result.gaussians, shown, dials),
+        "at_shares": at_shares(result.gaussians, shown),
+        "steps": result.steps,
+        "share": plan.config.share,
+        "start_seconds": round(plan.seconds["bands"] + result.start_seconds, 2),
+        "train_seconds": round(result.seconds, 2),
+    }
 
 
 def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[Row]:

@@ -17,7 +17,7 @@ from typing import Any
 from unittest.mock import patch
 
 import clod_adapter as clod
-from adapt import at_shares
+from adapt import adapted
 from clod_adapter.training import dial, far
 from clod_adapter.training.schedule import FAR
 from common import (
@@ -97,21 +97,9 @@ def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, valu
     elif name != "default":
         make = partial(make, **{name: value})
     with change:
-        plan = clod.make_plan(base, views, make())
-        adapted = plan.adapt(views)
-    result = adapted.gaussians
-    append(
-        FILE,
-        {
-            "scene": Path(scene).stem,
-            "choice": name,
-            "value": value,
-            "steps": adapted.steps,
-            "full": clod.evaluate(result, views.test, [1.0])[0].as_dict(),
-            "at_shares": at_shares(result, views.test),
-            "seconds": round(plan.seconds["bands"] + adapted.start_seconds + adapted.seconds, 1),
-        },
-    )
+        row = adapted(base, views, views.test, make())
+    about = {"scene": Path(scene).stem, "choice": name, "value": value, "full": row["rows"][0]}
+    append(FILE, about | row)
 
 
 def page_table() -> Table:

@@ -9,10 +9,9 @@ row to ``results/nophoto.jsonl``.
 """
 
 import time
-from dataclasses import asdict
 
 import clod_adapter as clod
-from adapt import at_shares
+from adapt import adapted
 from clod_adapter.training.pseudo_views import with_pseudo_views
 from common import Table, append, arguments, by_scene, checkpoint, last, psnr_at, quality
 from common import photographs as photographs_of
@@ -24,7 +23,7 @@ SHOWN = {  # in the table
     "complemented": "12 photographs and pseudo views",
     "placed": "none",
 }
-DIALS = (1.0, 2.0, 3.0, 5.0, 7.0)
+MAX_SV = 7.0
 
 
 def main() -> None:
@@ -38,7 +37,7 @@ def main() -> None:
     for scene in args.scenes:
         for kind in args.kinds:
             make = clod.AdaptConfig.placed if kind == "placed" else clod.AdaptConfig
-            run(scene, kind, make(max_sv=DIALS[-1]), args.few)
+            run(scene, kind, make(max_sv=MAX_SV), args.few)
 
 
 def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:
@@ -52,23 +51,9 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     if kind != "photographs":
         views = with_pseudo_views(base, None if kind == "placed" else photographs, config.seed)
     seconds = time.perf_counter() - began
-    adapted = clod.make_plan(base, views, config).adapt(views)
-    append(
-        FILE,
-        {
-            "scene": scene,
-            "kind": kind,
-            "config": asdict(config),
-            "views": len(views.train),
-            "photographs": len(photographs.train),
-            "base": base_row,
-            "rows": quality(adapted.gaussians, photographs.test, DIALS),
-            "at_shares": at_shares(adapted.gaussians, photographs.test),
-            "steps": adapted.steps,
-            "views_seconds": round(seconds, 2),
-            "train_seconds": round(adapted.seconds, 2),
-        },
-    )
+    about = {"scene": scene, "kind": kind, "base": base_row, "views_seconds": round(seconds, 2)}
+    about |= {"views": len(views.train), "photographs": len(photographs.train)}
+    append(FILE, about | adapted(base, views, photographs.test, config))
 
 
 def page_table() -> Table:
