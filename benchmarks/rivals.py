@@ -56,15 +56,12 @@ SHOWN = {  # in the table, by rival and end of the label
 def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument(
-        "--only", nargs="+", choices=RIVALS, default=RIVALS, help="some of the rivals"
-    )
     parser.add_argument("--iters", type=int, default=1500, help="steps of tuning")
     args = parser.parse_args()
     for scene in args.scenes:
         base, views = checkpoint(scene), photographs(scene)
         (untouched,) = quality(base.gaussians, views.test, 1.0)
-        for rival in args.only:
+        for rival in RIVALS:
             folder = capture(scene.partition("/")[0])
             for label, files, more in contest(rival, base, folder, views, args.iters):
                 rows = []

@@ -1,7 +1,6 @@
 """Time and memory of the commands by the number of Gaussians.
 
     python benchmarks/scaling.py    # some 15 minutes, 12 GB of memory, 8 GB of disk
-    python benchmarks/scaling.py --only adapt --sizes 100000 1000000
 
 Runs each command in its own process on synthetic towns, which are kept in benchmarks/cache.
 Measures wall and CPU seconds and peak memory. A town of 1000 Gaussians gives the start-up cost.
@@ -18,6 +17,7 @@ import tempfile
 import urllib.request
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from itertools import product
 from pathlib import Path
 
 from city import write_city
@@ -66,19 +66,13 @@ print(json.dumps({name: round(value, 3) for name, value in spent.items()}))
 
 
 def main() -> None:
-    parser = arguments(__doc__)
-    parser.add_argument("--only", choices=RUNS, help="one command")
-    parser.add_argument(
-        "--sizes", nargs="+", type=int, default=[FLOOR, *SIZES], help="numbers of Gaussians"
-    )
-    args = parser.parse_args()
+    arguments(__doc__).parse_args()
     CITIES.mkdir(parents=True, exist_ok=True)
     run_adapt(town(FLOOR))  # compiles the kernels
-    for count in args.sizes:
-        for command in [args.only] if args.only else RUNS:
-            cost = RUNS[command](town(count))
-            about = {"command": command, "gaussians": count, "busy": round(os.getloadavg()[0], 2)}
-            append(FILE, {"series": "count", **about, **cost})
+    for count, (command, run) in product((FLOOR, *SIZES), RUNS.items()):
+        cost = run(town(count))
+        about = {"command": command, "gaussians": count, "busy": round(os.getloadavg()[0], 2)}
+        append(FILE, {"series": "count", **about, **cost})
 
 
 def town(count: int) -> Path:

@@ -18,7 +18,7 @@ from itertools import product
 
 import clod_adapter as clod
 from clod_adapter.report.charts import draw_training, new_figure, save_figure
-from common import ROOT, Row, append, arguments, checkpoint, photographs, quality, stored
+from common import ROOT, Row, append, arguments, checkpoint, last, photographs, quality, stored
 from tuning import Tuning, by_importance, merge, tune
 
 FILE = "tradeoff.jsonl"
@@ -102,18 +102,15 @@ def row_of(file: clod.Gaussians, views: clod.Scene, s: float, count: int) -> Row
 
 def counts(scene: str) -> list[int]:
     """Gaussians that ours keeps at each dial value in its longest run, of equal ones the last."""
-    longest = max(
-        (r for r in reversed(stored(FILE)) if (r["scene"], r["method"]) == (scene, "ours")),
-        key=lambda row: row["iters"],
-    )
-    return [round(row["kept"]) for row in longest["rows"]]
+    runs = last(FILE, "iters", scene=scene, method="ours")
+    return [round(row["kept"]) for row in runs[max(runs)]["rows"]]
 
 
 def curves(scene: str, k: int) -> list[Row]:
     """Lines by method at the k-th dial value, by rising time; of equal runs the last."""
-    last = {(row["method"], row["iters"]): row for row in stored(FILE) if row["scene"] == scene}
+    runs = last(FILE, "method", "iters", scene=scene)
     points: dict[str, list[Row]] = {method: [] for method in LABELS}
-    for (method, _), row in sorted(last.items()):
+    for (method, _), row in sorted(runs.items()):
         point = row["rows"][k]
         points[method].append(
             {"seconds": row["seconds"][k], "psnr": point["psnr"], "share": point["kept_share"]}
