@@ -2,10 +2,8 @@
 
 import importlib.util
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from types import ModuleType
 
 import torch
 from torch import Tensor
@@ -26,7 +24,7 @@ class Backend:
     looser: float = 1.0
     drops_last: bool = False  # leaves out the Gaussian that ends a pixel, as gsplat does
 
-    def __call__(self, *args, **kwargs) -> tuple[Tensor, Tensor]:
+    def __call__(self, *args, **kwargs):
         def place(x):
             return x.to(self.device, self.dtype) if isinstance(x, Tensor) else x
 
@@ -37,12 +35,12 @@ class Backend:
         return image.cpu().float(), alpha.cpu().float()
 
     @property
-    def stands_in(self) -> bool:
+    def stands_in(self):
         """Whether torch replaces the kernels; its speed and threads are not the backend's."""
         return self.module == "cuda" and self.device == "cpu"
 
     @property
-    def rounding(self) -> dict[str, float]:
+    def rounding(self):
         """Tolerances between runs with one input, for ``assert_same`` and ``assert_close``."""
         return {"rtol": 0.0, "atol": 0.0} if self.repeats else {"rtol": 1e-3, "atol": 1e-3}
 
@@ -57,7 +55,7 @@ BACKENDS = {
 
 
 @contextmanager
-def torch_threads(count: int) -> Iterator[None]:
+def torch_threads(count):
     """Sets the number of torch's threads, which kernels then use for few rows too, and restores it
     at the end.
     """
@@ -72,7 +70,7 @@ def torch_threads(count: int) -> Iterator[None]:
         cpu.FEW = few
 
 
-def fresh_copy(monkeypatch, name: str, package: str, installed: ModuleType | None) -> ModuleType:
+def fresh_copy(monkeypatch, name, package, installed):
     """A second copy of ``clod_adapter.integrations.NAME``, imported with ``package`` replaced or
     absent.
     """

@@ -11,9 +11,7 @@ fails instead.
 
 import os
 import shutil
-from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, NoReturn
 
 import pytest
 
@@ -63,7 +61,7 @@ COMPUTE = """async ([source, statements, table]) => {
 }"""
 
 
-def compute(page, source: str, statements: str, table: Sequence[Sequence[float]]):
+def compute(page, source, statements, table):
     """The table after ``statements``; the page is from a secure place, such as loopback. Skips
     without WebGPU.
     """
@@ -73,7 +71,7 @@ def compute(page, source: str, statements: str, table: Sequence[Sequence[float]]
     return found
 
 
-def find() -> str:
+def find():
     named = os.environ.get("CLOD_CHROMIUM")
     for name in (named,) if named else NAMES:
         if path := shutil.which(name):
@@ -86,7 +84,7 @@ def find() -> str:
 
 
 @contextmanager
-def launch() -> Iterator[Any]:
+def launch():
     """A Playwright browser with its own profile; skips where there is none. Pages load as in a
     user's browser.
     """
@@ -106,7 +104,7 @@ def launch() -> Iterator[Any]:
             chromium.close()
 
 
-def missing(what: str) -> NoReturn:
+def missing(what):
     """Skips the test; fails it if CLOD_NEED_BROWSER is 1."""
     if os.environ.get("CLOD_NEED_BROWSER") == "1":
         pytest.fail(f"{what} (CLOD_NEED_BROWSER=1)")

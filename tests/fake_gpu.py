@@ -9,10 +9,8 @@ device.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any
 
 import pytest
 import torch
@@ -34,7 +32,7 @@ class Walled(Tensor):
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     @staticmethod
-    def __new__(cls, real: Tensor) -> Walled:
+    def __new__(cls, real):
         made = Tensor._make_wrapper_subclass(
             cls,
             real.shape,
@@ -51,7 +49,7 @@ class Walled(Tensor):
         return _run(function, args, kwargs or {})
 
 
-def _run(function, args, kwargs: dict[str, Any]):
+def _run(function, args, kwargs):
     tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
     walled = [x for x in tensors if isinstance(x, Walled)]
     outside = [x for x in tensors if not isinstance(x, Walled) and x.dim()]
@@ -76,7 +74,7 @@ def _run(function, args, kwargs: dict[str, Any]):
     )
 
 
-def _waits(function, args, kwargs: dict[str, Any], walled: list[Any]) -> bool:
+def _waits(function, args, kwargs, walled):
     """Whether the host waits for the device: it reads a value or a size, or copies and is not told
     to go on.
     """
@@ -92,7 +90,7 @@ def _waits(function, args, kwargs: dict[str, Any], walled: list[Any]) -> bool:
     return bool(walled) and not READS.isdisjoint(function.tags)
 
 
-def _place() -> str:
+def _place():
     """The innermost function of the package, as ``training/trainer.py:step``."""
     for frame in reversed(traceback.extract_stack()):
         _, inside, file = frame.filename.rpartition("/clod_adapter/")
@@ -102,7 +100,7 @@ def _place() -> str:
 
 
 @contextmanager
-def waits() -> Iterator[list[str]]:
+def waits():
     """The places at which the host waits for the device within the context, once for each time."""
     _log.clear()
     yield _log
@@ -127,7 +125,7 @@ class _Functions(TorchFunctionMode):
 
 
 @lru_cache(maxsize=1)
-def register() -> bool:
+def register():
     """Whether this torch has devices written in Python; registers this one, unless there is a real
     GPU: before the first backward pass, when autograd starts a thread per device.
     """
@@ -143,7 +141,7 @@ def register() -> bool:
 
     class Module(_DummyBackendModule):
         # torch.autocast asks for it, to be disabled too
-        def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        def get_amp_supported_dtype(self):
             return [torch.float16, torch.bfloat16]
 
     _setup_privateuseone_for_python_backend("gpu", Module())
@@ -151,7 +149,7 @@ def register() -> bool:
 
 
 @contextmanager
-def fake_gpu() -> Iterator[torch.device]:
+def fake_gpu():
     """The device, within the context; skips where torch does not support it."""
     if not register():
         pytest.skip("this torch has no devices that are written in Python")

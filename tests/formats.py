@@ -9,9 +9,7 @@ import re
 import shutil
 import struct
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint, load, save
+from clod_adapter.io.checkpoint import load, save
 from scenes import gaussians, seeded
 
 ATTENUATION = AttenuationConfig(reference_distance=3.217, max_sv=7.0)
@@ -34,13 +31,13 @@ ORIGIN = (5.1e5, -4096.0, 0.25)
 PACKED = Path(__file__).parent / "io" / "of_splat_transform" / "capture.compressed.ply"
 
 
-def examples(count: int) -> settings:
+def examples(count):
     """Settings of a property test that uses a fixture, such as tmp_path, for all its examples."""
     shared = [HealthCheck.function_scoped_fixture]
     return settings(deadline=None, max_examples=count, suppress_health_check=shared)
 
 
-def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians:
+def model(degree=3, count=40, *, growth=True):
     """With extreme values: opacity 1, sigma_d of 0 to 1e9, quaternions of length 1e-14 to 1e14,
     growth_d of -1 to 3.
     """
@@ -63,25 +60,25 @@ def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians
     )
 
 
-def axes_of(quats: torch.Tensor) -> torch.Tensor:
+def axes_of(quats):
     """``[N, 3, 3]`` float64, an axis in each column."""
     return torch.from_numpy(Rotation.from_quat(quats.double().roll(-1, 1).numpy()).as_matrix())
 
 
-def turned(a: torch.Tensor, b: torch.Tensor) -> float:
+def turned(a, b):
     """The sine of the largest angle between the axes of two ellipsoids, whose half turns are the
     same.
     """
     return float(torch.linalg.cross(axes_of(a), axes_of(b), dim=1).norm(dim=1).max())
 
 
-def covariances(g: Gaussians) -> torch.Tensor:
+def covariances(g):
     """``[N, 3, 3]`` float64, the same for every rotation that gives the same ellipsoid."""
     axes = axes_of(g.quats) * g.log_scales.double().exp()[:, None]
     return axes @ axes.mT
 
 
-def damaged(whole: bytes, data: st.DataObject) -> bytes:
+def damaged(whole, data):
     """A truncated file, or one with a few values overwritten, at its beginning more often than in
     the rest.
     """
@@ -99,7 +96,7 @@ def damaged(whole: bytes, data: st.DataObject) -> bytes:
     return bytes(changed)
 
 
-def splat_transform(*arguments: str | Path):
+def splat_transform(*arguments):
     """Runs splat-transform, from PATH or $CLOD_SPLAT_TRANSFORM; skips the test if it is missing."""
     command = os.environ.get("CLOD_SPLAT_TRANSFORM") or shutil.which("splat-transform")
     if command is None:
@@ -109,14 +106,14 @@ def splat_transform(*arguments: str | Path):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def rows_by_place(means: np.ndarray, others: np.ndarray) -> np.ndarray:
+def rows_by_place(means, others):
     """The row of ``others`` nearest to each of ``means``; all different."""
     rows = np.linalg.norm(means[:, None] - others[None], axis=2).argmin(1)
     assert len(set(rows)) == len(rows)
     return rows
 
 
-def change_setting(path: Path, name: str, old: str, new: str) -> Path:
+def change_setting(path, name, old, new):
     """Changes a setting in a file of any format that stores it, or in an adapter: text of the same
     length.
     """
@@ -124,7 +121,7 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     # of JSON, of JSON in JSON, and of the comments of a PLY
     pattern = rf'({name}\\?"?:? ?){old}(?![.\d])'.encode()
 
-    def changed(whole: bytes) -> bytes:
+    def changed(whole):
         found, count = re.subn(pattern, rb"\g<1>" + new.encode(), whole)
         assert count, f"{name} is not in {path}"
         return found
@@ -142,30 +139,28 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     return path
 
 
-def resaved(base: Checkpoint, gaussians: Gaussians | None = None) -> Checkpoint:
+def resaved(base, gaussians=None):
     """What is read of the PLY that is saved from a base, or from its Gaussians once tuned."""
     path = base.path.with_name("out.ply")
     save(path, gaussians or base.gaussians, base)
     return load(path)
 
 
-def write_rows(
-    path: Path, rows: np.ndarray, order: str = "<", comments: Iterable[str] = ()
-) -> Path:
+def write_rows(path, rows, order="<", comments=()):
     """A PLY of these vertices, in the byte order "<" or ">", or "ascii"."""
     return write_elements(
         path, [PlyElement.describe(rows, "vertex", comments=list(comments))], order
     )
 
 
-def write_elements(path: Path, elements: Sequence[PlyElement], order: str = "<") -> Path:
+def write_elements(path, elements, order="<"):
     PlyData(elements, text=order == "ascii", byte_order="=" if order == "ascii" else order).write(
         str(path)
     )
     return path
 
 
-def without_comments(path: Path, **columns) -> Path:
+def without_comments(path, **columns):
     """The file as another tool writes it: without its comments, some columns added or changed in
     every row.
     """
@@ -173,7 +168,7 @@ def without_comments(path: Path, **columns) -> Path:
     return write_rows(path.with_name("rewritten.ply"), rows)
 
 
-def with_columns(old: np.ndarray, **columns) -> np.ndarray:
+def with_columns(old, **columns):
     added = [(name, "f4") for name in columns if name not in old.dtype.names]
     rows = np.zeros(len(old), old.dtype.descr + added)
     for name in rows.dtype.names or ():
@@ -181,7 +176,7 @@ def with_columns(old: np.ndarray, **columns) -> np.ndarray:
     return rows
 
 
-def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+def change_glb(path, change):
     data = path.read_bytes()
     size = struct.unpack_from("<I", data, 12)[0]
     gltf = json.loads(data[20 : 20 + size])
@@ -194,16 +189,14 @@ def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     return path
 
 
-def needed(degree: int = 0) -> list[str]:
+def needed(degree=0):
     """The columns that every reader needs, in Inria's order."""
     rest = [f"f_rest_{k}" for k in range(3 * (SH_COUNTS[degree] - 1))]
     shape = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     return ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", *shape]
 
 
-def random_rows(
-    count: int, names: Sequence[str], seed: int = 0, types: dict[str, str] | None = None
-) -> np.ndarray:
+def random_rows(count, names, seed=0, types=None):
     """Normal values in columns of float32 or of ``types``."""
     rng = np.random.default_rng(seed)
     rows = np.empty(count, [(name, (types or {}).get(name, "f4")) for name in names])
@@ -214,7 +207,7 @@ def random_rows(
     return rows
 
 
-def inria_rows(g: Gaussians) -> np.ndarray:
+def inria_rows(g):
     """The vertices that Inria's trainer writes of these Gaussians, normals included; the dial's
     columns last.
     """

@@ -8,11 +8,9 @@ and what the packed kernels cannot do (a background, gsplat's issue 764) is refu
 
 import inspect
 from itertools import pairwise
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.999
@@ -27,9 +25,7 @@ def install(monkeypatch):
     from gsplat import rendering
     from gsplat.cuda import _torch_impl
 
-    def spherical_harmonics(
-        degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
-    ) -> Tensor:
+    def spherical_harmonics(degree, dirs, coeffs, masks=None):
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
 
     replaced = {
@@ -48,25 +44,25 @@ def install(monkeypatch):
 
 
 def fully_fused_projection(
-    means: Tensor,
-    covars: Tensor | None,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
+    means,
+    covars,
+    quats,
+    scales,
+    viewmats,
+    Ks,
+    width,
+    height,
     *,
-    eps2d: float,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    packed: bool,
-    sparse_grad: bool,
-    calc_compensations: bool,
-    camera_model: str,
-    opacities: Tensor | None = None,
-) -> tuple[Any, ...]:
+    eps2d,
+    near_plane,
+    far_plane,
+    radius_clip,
+    packed,
+    sparse_grad,
+    calc_compensations,
+    camera_model,
+    opacities=None,
+):
     """Without opacities gsplat 1.4.0's: one radius for both directions, no batches."""
     from gsplat.cuda import _torch_impl
 
@@ -115,21 +111,21 @@ def fully_fused_projection(
 
 @torch.no_grad()
 def isect_tiles(
-    means2d: Tensor,
-    radii: Tensor,
-    depths: Tensor,
-    tile_size: int,
-    tile_width: int,
-    tile_height: int,
+    means2d,
+    radii,
+    depths,
+    tile_size,
+    tile_width,
+    tile_height,
     *,
-    packed: bool,
-    gaussian_ids: Tensor | None,
-    segmented: bool = False,
-    n_images: int = 0,
-    n_cameras: int = 0,
-    image_ids: Tensor | None = None,
-    camera_ids: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
+    packed,
+    gaussian_ids,
+    segmented=False,
+    n_images=0,
+    n_cameras=0,
+    image_ids=None,
+    camera_ids=None,
+):
     image_ids = camera_ids if image_ids is None else image_ids
     if image_ids is None:
         image_ids = torch.arange(n_images or n_cameras, device=depths.device).repeat_interleave(
@@ -145,20 +141,20 @@ def isect_tiles(
 
 
 def rasterize_to_pixels(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    width: int,
-    height: int,
-    tile_size: int,
-    isect_offsets: Tensor,
-    flatten_ids: Tensor,
+    means2d,
+    conics,
+    colors,
+    opacities,
+    width,
+    height,
+    tile_size,
+    isect_offsets,
+    flatten_ids,
     *,
-    backgrounds: Tensor | None,
-    packed: bool,
-    absgrad: bool,
-) -> tuple[Tensor, Tensor]:
+    backgrounds,
+    packed,
+    absgrad,
+):
     assert not packed or backgrounds is None
     # the kernel sums the absolute values of all pixels: more than this
     if absgrad and means2d.requires_grad:
@@ -185,9 +181,7 @@ def rasterize_to_pixels(
     return drawn.unflatten(0, images), alphas.unflatten(0, images)
 
 
-def _blend(
-    x: Tensor, y: Tensor, centres: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor
-) -> Tensor:
+def _blend(x, y, centres, conics, opacities, colors):
     """Colours and alpha ``[H, W, D + 1]`` of Gaussians in order of depth."""
 
     dx = x[..., None] - centres[:, 0]

@@ -1,10 +1,8 @@
 """Stand-ins for several versions of gsplat: modules with their signatures."""
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 TEXT = Path(__file__).parent / "integrations" / "gsplat_signatures.txt"
 FUNCTIONS = (
@@ -15,7 +13,7 @@ FUNCTIONS = (
 )
 
 
-def signatures() -> dict[str, dict[str, str]]:
+def signatures():
     """``{version: {function: parameters}}`` as written in the text, without line breaks."""
     parts = re.split(r"^\[(.+)\]$", TEXT.read_text(), flags=re.M)[1:]
     found = {
@@ -26,7 +24,7 @@ def signatures() -> dict[str, dict[str, str]]:
     return {version: common | own for version, own in found.items()}
 
 
-def module(version: str, draw: Callable[[str, str, dict[str, Any]], Any] = lambda *given: given):
+def module(version, draw=lambda *given: given):
     """The module ``gsplat`` of this version; ``draw`` gets a function's name, the version and the
     arguments.
     """

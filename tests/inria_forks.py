@@ -11,7 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from clod_adapter import Camera, ScreenFilter
 from clod_adapter.cameras import intrinsics
@@ -32,7 +32,7 @@ FORKS = {  # settings in addition to SETTINGS, parameters of the call, results
 }
 
 
-def module(name: str, nearest: float = 0.2):
+def module(name, nearest=0.2):
     """The module ``diff_gaussian_rasterization`` of this fork; its rasterizer notes the arguments
     in ``given``.
     """
@@ -45,7 +45,7 @@ def module(name: str, nearest: float = 0.2):
             super().__init__()
             self.raster_settings = raster_settings
 
-        def forward(self, *args, **kwargs) -> tuple[Tensor, ...]:
+        def forward(self, *args, **kwargs):
             self.given = dict(zip(call.split(), args, strict=False)) | kwargs
             assert set(self.given) <= set(call.split())
             drawn = _draw(self.raster_settings, self.given, nearest)
@@ -65,7 +65,7 @@ def module(name: str, nearest: float = 0.2):
     return made
 
 
-def settings_of(kind, view: Camera, **others):
+def settings_of(kind, view, **others):
     """The fork's settings for a camera whose principal point is the image's middle."""
     values = {
         "image_height": view.height,
@@ -79,7 +79,7 @@ def settings_of(kind, view: Camera, **others):
     return kind(**{name: (values | others).get(name) for name in kind._fields})
 
 
-def _draw(settings, given: dict[str, Any], nearest: float) -> dict[str, Any]:
+def _draw(settings, given, nearest):
     """Every result of either fork; ``radii`` and ``touched`` have a row per Gaussian."""
     width = settings.image_width
     height = settings.image_height

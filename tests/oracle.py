@@ -6,16 +6,14 @@ excluded: they must be few, and may differ by the effect of one Gaussian at 1/25
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import Camera
-from clod_adapter.config import CLASSIC, ScreenFilter
-from clod_adapter.rasterizers import Splat, reference
+from clod_adapter.config import CLASSIC
+from clod_adapter.rasterizers import reference
 from scenes import seeded
 
 IMAGE, GRADIENT, ON_A_CUT = 2e-5, 5e-4, 0.02
@@ -31,19 +29,19 @@ class Result(NamedTuple):
     gradients: dict[str, Tensor]
 
 
-def weights(camera: Camera) -> tuple[Tensor, Tensor]:
+def weights(camera):
     g = seeded(0)
     size = (camera.height, camera.width)
     return torch.randn(*size, 3, generator=g), torch.randn(*size, generator=g)
 
 
 def differentiate(
-    rasterize: Splat,
-    scene: Parameters,
-    camera: Camera,
-    v: tuple[Tensor, Tensor],
-    screen_filter: ScreenFilter = CLASSIC,
-) -> Result:
+    rasterize,
+    scene,
+    camera,
+    v,
+    screen_filter=CLASSIC,
+):
     """Forward and backward, in the scene's float type."""
     dtype = scene["means"].dtype
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
@@ -58,14 +56,12 @@ def differentiate(
     )
 
 
-def on_a_cut(
-    scene: Parameters, camera: Camera, nudge: float, screen_filter: ScreenFilter
-) -> Tensor:
+def on_a_cut(scene, camera, nudge, screen_filter):
     """``[H, W]`` bool: pixels that change if the cuts move by ``nudge``, or have an alpha as near
     to the clamp.
     """
 
-    def draw(patch: pytest.MonkeyPatch, **constants) -> Tensor:
+    def draw(patch, **constants):
         for name, value in constants.items():
             patch.setattr(reference, name, value)
         behind = BACKGROUND.double()
@@ -91,24 +87,22 @@ def on_a_cut(
     return (images[0] != images[1]).any(-1) | at_the_clamp.reshape(camera.height, camera.width)
 
 
-def without_last(
-    alphas: Tensor, blend: Callable[..., Any] = reference.blend
-) -> tuple[Tensor, Tensor]:
+def without_last(alphas, blend=reference.blend):
     """``reference.blend`` without the Gaussians that end a pixel."""
     return blend(torch.where(torch.cumprod(1 - alphas, 1) > reference.T_MIN, alphas, 0))
 
 
 def assert_agrees(
-    rasterize: Splat,
-    scene: Parameters,
-    camera: Camera,
+    rasterize,
+    scene,
+    camera,
     *,
-    image: float = IMAGE,
-    gradient: float = GRADIENT,
-    cut: float = ON_A_CUT,
-    nudge: float = 1e-4,
-    rows: Tensor | None = None,
-    screen_filter: ScreenFilter = CLASSIC,
+    image=IMAGE,
+    gradient=GRADIENT,
+    cut=ON_A_CUT,
+    nudge=1e-4,
+    rows=None,
+    screen_filter=CLASSIC,
 ):
     """Asserts agreement; with ``rows``, with the picture of those alone, and gradients of 0 for the
     others.
@@ -151,7 +145,7 @@ def assert_agrees(
         )
 
 
-def assert_same(a: Result, b: Result, **tolerance):
+def assert_same(a, b, **tolerance):
     """Asserts equality: bit for bit, or within ``torch.testing.assert_close``'s tolerances."""
     pairs = [("image", a.image, b.image), ("alpha", a.alpha, b.alpha)]
     for name, x, y in [

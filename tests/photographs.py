@@ -1,16 +1,13 @@
 """Photographs and their COLMAP models, shared by the tests of readers."""
 
 import json
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 import torch
 from PIL import Image
 
-from clod_adapter.cameras import Camera, Scene, View, intrinsics
+from clod_adapter.cameras import Camera, intrinsics
 from models import write_model
 
 SIZE = {"width": 160, "height": 120}
@@ -27,7 +24,7 @@ LENSES = {
 }
 
 
-def pose(seed: int) -> torch.Tensor:
+def pose(seed):
     rotation, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     rotation *= np.sign(np.linalg.det(rotation))
     viewmat = np.eye(4)
@@ -35,16 +32,16 @@ def pose(seed: int) -> torch.Tensor:
     return torch.from_numpy(viewmat).float()
 
 
-def camera(seed: int, width: int = 40, height: int = 30, focal: float = 35.5) -> Camera:
+def camera(seed, width=40, height=30, focal=35.5):
     K = intrinsics(focal, focal + 1, 19.25, 15.5)
     return Camera(pose(seed), K, width, height)
 
 
-def pixels(seed: int, width: int = 40, height: int = 30) -> np.ndarray:
+def pixels(seed, width=40, height=30):
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
-def write_scene(folder: Path, count: int = 10) -> tuple[list[Camera], list[str]]:
+def write_scene(folder, count=10):
     """A scene whose model lists its images in another order than their names."""
     cameras = [camera(i, focal=30.0 + i % 2) for i in range(count)]
     names = [f"sub/{count - i:03d}.png" for i in range(count)]
@@ -53,43 +50,43 @@ def write_scene(folder: Path, count: int = 10) -> tuple[list[Camera], list[str]]
     return cameras, names
 
 
-def write_images(folder: Path, names: Sequence[str]):
+def write_images(folder, names):
     """The ``pixels`` of 0, 1, 2, ..."""
     for i, name in enumerate(names):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels(i)).save(folder / name)
 
 
-def to_world(seed: int) -> list[list[float]]:
+def to_world(seed):
     """``pose(seed)`` as a transforms file has it: camera to world, OpenGL axes."""
     return (np.linalg.inv(pose(seed).double().numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
-def write_frames(folder: Path, frames: list[Any], file: str = "transforms.json", **rest) -> Path:
+def write_frames(folder, frames, file="transforms.json", **rest):
     folder.mkdir(exist_ok=True)
     (folder / file).write_text(json.dumps({**rest, "frames": frames}))
     return folder
 
 
-def names_of(views: Sequence[View]) -> list[str]:
+def names_of(views):
     return [view.camera.name for view in views]
 
 
-def views_of(scene: Scene) -> list[View]:
+def views_of(scene):
     """Those for training and for testing, sorted by name."""
     return sorted((*scene.train, *scene.test), key=lambda view: view.camera.name)
 
 
 def model_of(
-    folder: Path,
-    kind: str,
-    params: Sequence[float],
-    width: int = 40,
-    height: int = 30,
+    folder,
+    kind,
+    params,
+    width=40,
+    height=30,
     *,
-    names: Sequence[str] = ("a.png",),
-    form: str = "binary",
-) -> Path:
+    names=("a.png",),
+    form="binary",
+):
     """The folder of a COLMAP model whose cameras are all at the origin and see two points."""
     reconstruction = pycolmap.Reconstruction()
     lens = pycolmap.Camera(model=kind, params=params, camera_id=1, width=width, height=height)
@@ -109,7 +106,7 @@ def model_of(
     return target
 
 
-def seen(camera: pycolmap.Camera) -> np.ndarray:
+def seen(camera):
     """``[H, W, 3]`` uint8: a smooth pattern on the plane z = 1, seen through the lens of a camera
     at the origin.
     """

@@ -5,6 +5,6 @@ import pytest
 from clod_adapter.errors import ClodError
 
 
-def refused(message: str):
+def refused(message):
     """Expects a ClodError with a message that matches this pattern."""
     return pytest.raises(ClodError, match=message)

@@ -8,19 +8,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain, count
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
 import torch.distributed as dist
 
 import clod_adapter
-from clod_adapter import AdaptConfig, Progress
-from clod_adapter.training.state import TrainingState
+from clod_adapter import AdaptConfig
 from clod_adapter.training.trainer import Trainer
 from scenes import stripped
 
@@ -67,7 +64,7 @@ for line in sys.stdin:
 """
 
 
-def accepted(words: Sequence[object]) -> list[str]:
+def accepted(words):
     """The words of a command, as text; adapting, which takes few steps here, accepts its loss."""
     texts = list(map(str, words))
     adapts = texts and Path(texts[0]).suffix and "--help" not in texts
@@ -87,11 +84,11 @@ class Server:
         )
         assert self.process.stdout.readline() == "ready\n"
 
-    def ask(self, **about) -> int:
+    def ask(self, **about):
         self.process.stdin.write(json.dumps(about) + "\n")
         return int(self.process.stdout.readline())
 
-    def start(self, folder: Path, *words, rank="", before: str = "", **environment) -> int:
+    def start(self, folder, *words, rank="", before="", **environment):
         """The process's id, valid until it is waited for; ``before`` is code that it runs first."""
         return self.ask(
             folder=str(folder),
@@ -101,10 +98,10 @@ class Server:
             environment={name: str(value) for name, value in environment.items()},
         )
 
-    def wait(self, pid: int) -> int:
+    def wait(self, pid):
         return self.ask(wait=pid)
 
-    def run(self, folder: Path, *words) -> str:
+    def run(self, folder, *words):
         """What was printed."""
         assert self.wait(self.start(folder, *words)) == 0, log_of(folder)
         return log_of(folder)
@@ -115,9 +112,7 @@ class Launched:
     ``wait`` exists.
     """
 
-    def __init__(
-        self, server: Server, folder: Path, *words, size: int = 2, before=None, wait: str = ""
-    ):
+    def __init__(self, server, folder, *words, size=2, before=None, wait=""):
         folder.mkdir(exist_ok=True)
         self.server, self.folder = server, folder
         self.store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
@@ -143,38 +138,38 @@ class Launched:
         ]
         wait_for(folder / wait)
 
-    def log(self, rank: int) -> str:
+    def log(self, rank):
         return log_of(self.folder, rank)
 
-    def wait(self) -> list[int]:
+    def wait(self):
         return [self.server.wait(pid) for pid in self.pids]
 
-    def report(self) -> dict[str, Any]:
+    def report(self):
         assert [name for name in names(self.folder) if name != STATE] == OUTPUTS, self.log(0)
         assert clod_adapter.load(self.folder / "dial.ply").gaussians.sigma_d is not None
         clod_adapter.load_adapter(self.folder / "dial.safetensors")
         return json.loads((self.folder / "dial.json").read_text())
 
 
-def counted(steps: list[tuple[int, int]]) -> Callable[[Progress], None]:
+def counted(steps):
     """A progress callback that notes how much is done, of how much."""
     return lambda now: steps.append((now.done, now.total))
 
 
-def names(folder: Path) -> list[str]:
+def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def log_of(folder: Path, rank="") -> str:
+def log_of(folder, rank=""):
     return Path(f"{folder}{rank}.log").read_text()
 
 
-def contents(*roots: Path) -> dict[Path, bytes]:
+def contents(*roots):
     paths = chain(roots, *(root.rglob("*") for root in roots))
     return {path: path.read_bytes() for path in paths if path.is_file()}
 
 
-def results(folder: Path, name: str = "dial") -> dict[str, bytes]:
+def results(folder, name="dial"):
     """The PLY and the adapter, without measured times."""
     return {
         suffix: stripped((folder / f"{name}{suffix}").read_bytes())
@@ -182,13 +177,13 @@ def results(folder: Path, name: str = "dial") -> dict[str, bytes]:
     }
 
 
-def rebuilt(clod: Callable[..., Any], base, *more: str) -> bool:
+def rebuilt(clod, base, *more):
     """Whether ``apply`` gives ``dial.ply`` from its adapter, bit for bit."""
     clod("apply", base, "dial.safetensors -o same.ply", *more)
     return Path("same.ply").read_bytes() == Path("dial.ply").read_bytes()
 
 
-def wait_for(path: Path, text: str = ""):
+def wait_for(path, text=""):
     """Until the file exists and has this text."""
     until = time.monotonic() + 60
     while not path.exists() or (text and text not in path.read_text()):
@@ -196,7 +191,7 @@ def wait_for(path: Path, text: str = ""):
         time.sleep(0.002)
 
 
-def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[..., Any]:
+def pressing(real, *numbers, at=1):
     """``real``, interrupted by these signals at the beginning of its ``at``-th call."""
     calls = count(1)
 
@@ -209,21 +204,21 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
 
 
 @contextmanager
-def pressed(place, name: str, *numbers: int, at: int = 1) -> Iterator[None]:
+def pressed(place, name, *numbers, at=1):
     """Within the context a function, ``place.name``, is interrupted as by ``pressing``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(place, name, pressing(getattr(place, name), *numbers, at=at))
         yield
 
 
-def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]):
+def change_step(patch, at, change):
     """Replaces the gradients of the ``at``-th step by ``change`` of them, not in the kernels' runs
     of one step.
     """
     real = Trainer.gradient_sum
     steps = count(1)
 
-    def changed(self: Trainer, *given):
+    def changed(self, *given):
         gradients = real(self, *given)
         chosen = self.config.iters > 1 and next(steps) == at
         return change(gradients) if chosen else gradients
@@ -231,7 +226,7 @@ def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]
     patch.setattr(Trainer, "gradient_sum", changed)
 
 
-def config_of(**changes) -> AdaptConfig:
+def config_of(**changes):
     """Fixed settings, so that the tests do not depend on the defaults."""
     settings = {
         "start_share": 0.6,
@@ -247,10 +242,10 @@ def config_of(**changes) -> AdaptConfig:
     return AdaptConfig(**(settings | changes))
 
 
-def states_of(steps: set[int], found: dict[int, TrainingState]) -> Callable[[Progress], None]:
+def states_of(steps, found):
     """A progress callback that keeps the states after these steps."""
 
-    def keep(progress: Progress):
+    def keep(progress):
         if progress.state and progress.done in steps:
             found[progress.done] = copy.deepcopy(progress.state())
 

@@ -6,23 +6,22 @@ from functools import partial
 
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from clod_adapter import AttenuationConfig, Camera, Gaussians, Scene, View, render
 from clod_adapter.cameras import intrinsics
 
 
-def seeded(seed: int) -> torch.Generator:
+def seeded(seed):
     return torch.Generator().manual_seed(seed)
 
 
 def camera(
-    width: int = 61,
-    height: int = 45,
+    width=61,
+    height=45,
     *,
-    fov: float = 60.0,
-    off_centre: tuple[float, float] = (0.52, 0.47),
-) -> Camera:
+    fov=60.0,
+    off_centre=(0.52, 0.47),
+):
     """At (0.3, -0.2, -3), looking roughly along +z, principal point at ``off_centre`` shares of the
     image.
     """
@@ -35,12 +34,12 @@ def camera(
     return Camera(viewmat, K, width, height)
 
 
-def in_front(view: Camera, points: Tensor) -> Tensor:
+def in_front(view, points):
     """World positions of camera-space ``points [n, 3]``."""
     return view.position + points @ view.viewmat[:3, :3]
 
 
-def scene(n: int, degree: int, seed: int, *, size: float = 0.08) -> dict[str, Tensor]:
+def scene(n, degree, seed, *, size=0.08):
     """Activated float32 parameters of n Gaussians in front of, beside and behind the camera."""
     normal = partial(torch.randn, generator=seeded(seed))
     return {
@@ -53,7 +52,7 @@ def scene(n: int, degree: int, seed: int, *, size: float = 0.08) -> dict[str, Te
     }
 
 
-def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussians:
+def gaussians(n, degree, seed, *, size=0.08):
     """The same Gaussians as a checkpoint stores them."""
     s = scene(n, degree, seed, size=size)
     logs = s["scales"].log()
@@ -61,7 +60,7 @@ def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussian
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
 
 
-def dialled(n: int, degree: int, seed: int, **settings) -> Gaussians:
+def dialled(n, degree, seed, **settings):
     """Gaussians with a sigma_d log-normal around e, and 0 in every 50th row."""
     sigma_d = (torch.randn(n, generator=seeded(seed + 1)) + 1).exp()
     sigma_d[::50] = 0.0
@@ -69,7 +68,7 @@ def dialled(n: int, degree: int, seed: int, **settings) -> Gaussians:
     return gaussians(n, degree, seed).replace(sigma_d=sigma_d, attenuation=attenuation)
 
 
-def looking(towards: Tensor) -> Tensor:
+def looking(towards):
     """``[4, 4]`` world to camera of a camera at the origin, y down."""
     forward = towards / towards.norm()
     right = torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward)
@@ -79,7 +78,7 @@ def looking(towards: Tensor) -> Tensor:
     return viewmat
 
 
-def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:
+def ring(count, width, height, *, radius=4.0):
     """Cameras on a circle around the origin, looking at it, at slightly different heights and
     distances.
     """
@@ -96,20 +95,18 @@ def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Ca
 
 
 @torch.no_grad()
-def photograph(truth: Gaussians, cameras: list[Camera]) -> tuple[View, ...]:
+def photograph(truth, cameras):
     return tuple(View(each, render(truth, each).pixels) for each in cameras)
 
 
-def capture(
-    n: int = 300, views: int = 8, width: int = 48, height: int = 36, seed: int = 0
-) -> tuple[Gaussians, Scene]:
+def capture(n=300, views=8, width=48, height=36, seed=0):
     """A slightly perturbed checkpoint and photographs of the original; every fourth one is held
     out.
     """
     truth = gaussians(n, 1, seed, size=0.15)
     g = seeded(seed + 1)
 
-    def near(values: Tensor, by: float) -> Tensor:
+    def near(values, by):
         return values + by * torch.randn(values.shape, generator=g)
 
     base = truth.replace(
@@ -122,14 +119,14 @@ def capture(
     return base, Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 
 
-def assert_equal(a: Gaussians, b: Gaussians):
+def assert_equal(a, b):
     """Asserts that both have the same bits and the same attenuation settings."""
     assert a.tensors().keys() == b.tensors().keys() and a.attenuation == b.attenuation
     for name, value in a.tensors().items():
         assert torch.equal(value, b.tensors()[name]), name
 
 
-def stripped(data: bytes) -> bytes:
+def stripped(data):
     """A file without its calibration's times, which are not reproducible."""
     if data.startswith(b"ply"):
         return re.sub(rb"(?m)^(comment clod_adapter calibrated .*) \S+$", rb"\1", data)

@@ -6,17 +6,14 @@ import base64
 import io
 import json
 import threading
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 
-from clod_adapter import Camera, Rendering
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import make_page
@@ -45,18 +42,18 @@ class Shown:
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
 
-    def ready(self, url: str) -> Shown:
+    def ready(self, url):
         self.page.goto(url)
         self.run("clod.ready")
         return self
 
-    def run(self, script: str, *arguments):
+    def run(self, script, *arguments):
         waiting = (
             f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}"
         )
         return self.evaluate(waiting, *arguments)
 
-    def until(self, condition: str):
+    def until(self, condition):
         """Waits until it holds. Not Playwright's wait_for_function, which the page's policy forbids
         to evaluate.
         """
@@ -69,43 +66,43 @@ class Shown:
         }})"""
         self.evaluate(script)
 
-    def evaluate(self, script: str, *arguments):
+    def evaluate(self, script, *arguments):
         return self.page.evaluate(script, *arguments)
 
-    def press(self, key: str):
+    def press(self, key):
         self.page.keyboard.press(key)
 
     @property
-    def dial(self) -> str:
+    def dial(self):
         """The dial value, as the page writes it."""
         return self.text("#dial-value")
 
-    def text(self, selector: str) -> str:
+    def text(self, selector):
         return str(self.page.inner_text(selector))
 
-    def camera(self, camera: Camera):
+    def camera(self, camera):
         self.run("clod.setCamera(given)", camera_entry(camera))
 
-    def picture(self) -> np.ndarray:
+    def picture(self):
         """``[H, W, 3]`` uint8 of the splats alone at full resolution."""
         data = self.run("clod.capture()").partition(",")[2]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
-    def link(self) -> str:
+    def link(self):
         """The state of the page, as the part of its address that L adds."""
         self.press("l")
         return str(self.evaluate("location.hash"))
 
-    def counts(self) -> dict[str, int]:
+    def counts(self):
         return dict(self.evaluate("clod.whenDrawn().then(clod.counts)"))
 
 
-def assert_alike(picture: np.ndarray, wanted: np.ndarray):
+def assert_alike(picture, wanted):
     """Asserts a PSNR of at least WITHIN between two pictures ``[H, W, 3]`` uint8."""
     assert peak_signal_noise_ratio(wanted, picture) >= WITHIN
 
 
-def assert_same(shown: Shown, wanted: Rendering):
+def assert_same(shown, wanted):
     """Asserts that the page shows the picture of our renderer and counts the same Gaussians."""
     counts = shown.counts()
     kept = int(wanted.kept.sum())
@@ -113,7 +110,7 @@ def assert_same(shown: Shown, wanted: Rendering):
     assert abs(counts["kept"] - kept) <= COUNTS * kept and counts["total"] == len(wanted.kept)
 
 
-def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0):
+def drop(shown, name, data, *, wait=0):
     """Drops a file on the page that can be read after ``wait`` milliseconds; a name without a
     suffix never can be.
     """
@@ -131,7 +128,7 @@ def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0):
     shown.evaluate(script, [name, base64.b64encode(data).decode(), wait])
 
 
-def message(shown: Shown, name: str) -> str:
+def message(shown, name):
     """The page's error message about the file, once there is one; the message is then dismissed."""
     shown.until(f"document.getElementById('message').textContent.includes('{name}')")
     said = shown.text("#message")
@@ -140,14 +137,14 @@ def message(shown: Shown, name: str) -> str:
     return said
 
 
-def fold(shown: Shown, open: bool):
+def fold(shown, open):
     shown.page.set_viewport_size(TALL if open else SIZE)
     expanded = json.dumps(str(open).lower())
     script = f"fold => fold.getAttribute('aria-expanded') === {expanded} || fold.click()"
     shown.page.eval_on_selector("#fold", script)
 
 
-def take(shown: Shown, path: Path):
+def take(shown, path):
     """Shows another file in the tab, by the page's own function, and waits until it is drawn."""
     script = (
         "clod.load(Uint8Array.from(atob(given[1]), (letter) => letter.charCodeAt(0)).buffer,"
@@ -157,7 +154,7 @@ def take(shown: Shown, path: Path):
 
 
 @contextmanager
-def serve(*words) -> Iterator[str]:
+def serve(*words):
     """The address of a server of ``clod-adapt view`` with these arguments, by default at s = 1,
     where it stays.
     """

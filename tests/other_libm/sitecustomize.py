@@ -16,11 +16,8 @@ import os
 import sys
 import warnings
 import zlib
-from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 SEED = os.environ.get("OTHER_LIBM")
 # smaller whole numbers and powers of two are exact everywhere: log2(8), exp(0), sigmoid(0)
@@ -33,11 +30,11 @@ TORCH = f"{COMMON} {OF_TORCH}".split()
 EXACT = (-2, -1, -0.5, 0, 0.5, 1, 2, 3)  # powers that are products, roots or quotients
 
 
-def salt(library: str) -> int:
+def salt(library):
     return zlib.crc32(f"{library} {SEED}".encode())
 
 
-def move(values: Any, library: str) -> None:
+def move(values, library):
     """Moves the floats of a contiguous 1-D array, in place; part by part, which needs little
     memory.
     """
@@ -63,10 +60,10 @@ def move(values: Any, library: str) -> None:
             part[:] = np.where(stays, part, np.nextafter(part, towards))
 
 
-def change_math() -> None:
-    def moved(function: Callable[..., float]) -> Callable[..., float]:
+def change_math():
+    def moved(function):
         @wraps(function)
-        def other(*args: Any) -> float:
+        def other(*args):
             x = function(*args)
             if (
                 not math.isfinite(x)
@@ -84,14 +81,14 @@ def change_math() -> None:
         setattr(math, name, moved(getattr(math, name)))
 
 
-def change_numpy(numpy: ModuleType) -> None:
+def change_numpy(numpy):
     class Other:
         """A call of the ufunc is moved; the rest is the ufunc's own."""
 
-        def __init__(self, ufunc: Any) -> None:
+        def __init__(self, ufunc):
             self.ufunc = ufunc
 
-        def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        def __call__(self, *args, **kwargs):
             found = self.ufunc(*args, **kwargs)
             values = numpy.array(found, order="C")
             move(values.reshape(-1), "numpy")
@@ -100,27 +97,27 @@ def change_numpy(numpy: ModuleType) -> None:
             numpy.copyto(found, values, where=kwargs.get("where", True))
             return found
 
-        def __getattr__(self, name: str) -> Any:
+        def __getattr__(self, name):
             return getattr(self.ufunc, name)
 
     for name in NUMPY:
         setattr(numpy, name, Other(getattr(numpy, name)))
 
 
-def change_torch(torch: ModuleType) -> None:
+def change_torch(torch):
     library = torch.library.Library("aten", "IMPL")
     change_torch.keep = library  # its kernels end with it
 
-    def moved(tensor: Any) -> None:
+    def moved(tensor):
         values = tensor.detach().contiguous()
         move(values.view(-1).numpy(), "torch")
         if values.data_ptr() != tensor.data_ptr():
             tensor.copy_(values)
 
-    def change(name: str) -> None:
+    def change(name):
         kernel = torch.library.get_kernel(name, "CPU")
 
-        def other(keys: Any, *args: Any, **kwargs: Any) -> Any:
+        def other(keys, *args, **kwargs):
             found = kernel.call_boxed(keys, *args, **kwargs)
             if not (
                 name.startswith("aten::pow")
@@ -141,7 +138,7 @@ def change_torch(torch: ModuleType) -> None:
                 change(name)
 
 
-def change_stamp(compiling: ModuleType) -> None:
+def change_stamp(compiling):
     # compiled code of its own
     compiling._STAMP += f"{SEED} {zlib.crc32(Path(__file__).read_bytes())}"
 
@@ -156,13 +153,13 @@ class Finder:
     }
 
     @classmethod
-    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
+    def find_spec(cls, name, path=None, target=None):
         change = cls.CHANGES.get(name)
         spec = importlib.machinery.PathFinder.find_spec(name, path) if change else None
         if spec:
             execute = spec.loader.exec_module
 
-            def both(module: ModuleType) -> None:
+            def both(module):
                 execute(module)
                 change(module)
 
