@@ -76,7 +76,6 @@ def fresh_copy(monkeypatch, name, package, installed):
     """
     monkeypatch.setitem(sys.modules, package, installed)
     spec = importlib.util.find_spec(f"clod_adapter.integrations.{name}")
-    assert spec is not None and spec.loader is not None
     copy = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(copy)
     return copy

@@ -29,7 +29,7 @@ class Walled(Tensor):
     """A tensor of the device; ``inner`` is the CPU tensor."""
 
     inner: Tensor
-    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+    __torch_function__ = torch._C._disabled_torch_function_impl
 
     @staticmethod
     def __new__(cls, real):

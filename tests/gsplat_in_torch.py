@@ -67,7 +67,6 @@ def fully_fused_projection(
     from gsplat.cuda import _torch_impl
 
     if covars is None:
-        assert quats is not None
         # as the kernel: of any length, and NaN where it is 0
         quats = quats / quats.norm(dim=-1, keepdim=True)
         covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)

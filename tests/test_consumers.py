@@ -85,7 +85,7 @@ def baked(**given):
 
 def hook(model):
     own = model.cpu()  # the hook follows the means
-    dialled = Hook(own.sigma_d, own.attenuation, DIAL, own.growth_d)  # type: ignore[arg-type]
+    dialled = Hook(own.sigma_d, own.attenuation, DIAL, own.growth_d)
     return list(dialled(model.means, model.opacities, CAMERAS[0].viewmat))
 
 

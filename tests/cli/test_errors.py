@@ -65,7 +65,7 @@ def given(folder, existing):
     """
     made = []
     for word in existing.split():
-        name, kind, target = re.fullmatch(r"([^>~]+)([>~]?)(.*)", word).groups()  # type: ignore[union-attr]
+        name, kind, target = re.fullmatch(r"([^>~]+)([>~]?)(.*)", word).groups()
         made.append(path := folder / name)
         if kind:
             (path.symlink_to if kind == ">" else path.hardlink_to)(folder / target)

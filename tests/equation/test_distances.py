@@ -93,7 +93,7 @@ def test_changing_the_unit_keeps_the_dial(distance, s, form, known):
         growth_d=torch.linspace(-1, 3, 400),
     )
     other = with_distance(some, distance)
-    assert other.attenuation is not None and other.attenuation.scene_distance == distance
+    assert other.attenuation.scene_distance == distance
     assert units.known_distance(other.attenuation) == (known or 3.7)
     found, want = (dial(each, camera(), s) for each in (other, some))
     torch.testing.assert_close(found.drawn, want.drawn, rtol=1e-12, atol=1e-12)
@@ -106,7 +106,7 @@ def test_what_stands_for_infinity_keeps_its_sigma():
     sigma = torch.tensor([0.0, -1.0, SIGMA_MAX, 2.0, 9e8, math.inf])
     some = with_dial(gaussians(6, 0, 0), sigma, AttenuationConfig(scene_distance=8.0))
     there = in_world_units(some)
-    assert there.sigma_d is not None and there.sigma_d.tolist() == [
+    assert there.sigma_d.tolist() == [
         0.0,
         -8.0,
         SIGMA_MAX,

@@ -131,7 +131,7 @@ def test_lock_keeps_other_processes_out_until_its_own_is_killed(tmp_path):
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(final)], stdout=subprocess.PIPE, text=True
     )
-    assert holder.stdout is not None and holder.stdout.readline() == "held\n"
+    assert holder.stdout.readline() == "held\n"
     remove_leftovers(final)  # as a second run would
     for path, name in ((final, final), (tmp_path / "OUT.ply", Path("all"))):
         with (

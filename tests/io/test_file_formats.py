@@ -167,8 +167,6 @@ def test_dial_round_trips(tmp_path, suffix, turn, far, growth):
     write(tmp_path / f"b{suffix}", g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
     assert path.read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
     seen = inspect(path)
-    assert seen.splat is not None
-    assert seen.splat.dial is not None
     assert seen.splat.dial.calibration == CALIBRATION
     assert seen.splat.dial_columns == "sigma_d" + growth * " and growth_d"
     save(tmp_path / "out.ply", found.gaussians, found, calibration=found.calibration)
@@ -189,7 +187,7 @@ def test_model_without_dial_round_trips(tmp_path, suffix):
     assert (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
     assert any("quantised" in note for note in found.notes) == (suffix in (".spz", ".splat"))
     seen = inspect(path)
-    assert seen.splat is not None and seen.splat.dial is None
+    assert seen.splat.dial is None
     assert seen.what.endswith(suffix if suffix != ".ply" else "PLY")
 
 

@@ -221,7 +221,7 @@ def test_header_and_record_of_an_spz(tmp_path):
     kind, size, text = struct.unpack_from("<III", data, end + 12)
     assert kind == 0x434C0001 and len(data) == end + 20 + size and size == 4 + text + 2 * 2 * 40
     document, values = json.loads(data[end + 24 : end + 24 + text]), data[end + 24 + text :]
-    assert document["columns"] == ["sigma_d", "growth_d"] and g.growth_d is not None
+    assert document["columns"] == ["sigma_d", "growth_d"]
     assert_array_equal(np.frombuffer(values, "<f2")[40:], g.growth_d.half())
     write(tmp_path / "b.spz", detach(g))
     assert spz(tmp_path / "b.spz") == data[: end + 12]
@@ -260,7 +260,6 @@ def test_spz_of_version_2(tmp_path):
 
 def grown(g, s):
     """``[N, 3]`` logarithms of the scales that a camera at 0 sees."""
-    assert g.attenuation is not None and g.growth_d is not None
     from_0 = replace(camera(), viewmat=torch.eye(4))
     d = normalized_distances(g.means, from_0, g.attenuation)
     return (
@@ -285,7 +284,7 @@ def test_units_of_an_spz(tmp_path, typical, known, step):
     )
     write(tmp_path / "a.spz", g)
     again = load(tmp_path / "a.spz").gaussians
-    assert again.attenuation is not None and again.attenuation.scene_distance == 1
+    assert again.attenuation.scene_distance == 1
     assert not known or again.attenuation.reference_distance == typical
     assert_close(again.sigma_d, sigma, rtol=2.0**-11, atol=0)
     assert (again.means - means).abs().max() <= step
@@ -305,7 +304,7 @@ def test_far_positions_of_an_spz(tmp_path):
     far = g.replace(means=means, log_scales=scales)
     notes = write(path, far)
     again = load(path).gaussians
-    assert again.sigma_d is not None and "the 1 farthest are moved to 64 from 0" in notes[0]
+    assert "the 1 farthest are moved to 64 from 0" in notes[0]
     others, factor = torch.arange(400) != 9, 64 / 3e5
     assert (again.means - means)[others].abs().max() <= 2.0**-17
     assert_close(again.means[9], means[9] * factor, atol=1e-4, rtol=1e-4)

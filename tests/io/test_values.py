@@ -117,7 +117,7 @@ def test_activated_opacities_extreme_values(tmp_path):
     assert_close(base.gaussians.opacities[:4], torch.tensor([0, 1, 1, 0.05]), atol=1e-7, rtol=1e-5)
     assert "1 above 1 taken as 1" in base.notes[0]
     with refused("activated is 'yes'.*none, opacity, scales, both"):
-        load(tmp_path / "in.ply", activated="yes")  # type: ignore[arg-type]
+        load(tmp_path / "in.ply", activated="yes")
     vertex["opacity"] = 1
     with refused("opacity from 1 to 1"):
         load(write_rows(tmp_path / "in.ply", vertex))

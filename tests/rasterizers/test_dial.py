@@ -32,7 +32,7 @@ def results(rasterizer, model, s, *frozen):
     image, alpha = rasterizer.draw(model.replace(**drawn), VIEW, s, background=leaves["background"])
     weighed = sum((x * torch.rand(x.shape, generator=random)).sum() for x in (image, alpha))
     asked = {name: x for name, x in leaves.items() if x.requires_grad}
-    slopes = torch.autograd.grad(weighed, list(asked.values()))  # type: ignore[arg-type]
+    slopes = torch.autograd.grad(weighed, list(asked.values()))
     return image.detach(), alpha.detach(), dict(zip(asked, slopes, strict=True))
 
 
