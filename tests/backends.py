@@ -79,3 +79,19 @@ def fresh_copy(monkeypatch, name, package, installed):
     copy = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(copy)
     return copy
+
+
+def gsplat_arguments(g, camera):
+    """What ``gsplat.rasterization`` is given of Gaussians and a camera."""
+    return {
+        "means": g.means,
+        "quats": g.quats,
+        "scales": g.scales,
+        "opacities": g.opacities,
+        "colors": torch.cat([g.sh0, g.shN], 1),
+        "sh_degree": g.sh_degree,
+        "viewmats": camera.viewmat[None],
+        "Ks": camera.K[None],
+        "width": camera.width,
+        "height": camera.height,
+    }

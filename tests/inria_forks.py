@@ -65,6 +65,18 @@ def module(name, nearest=0.2):
     return made
 
 
+def arguments_of(g):
+    """What the rasterizer is given of Gaussians, by name."""
+    return {
+        "means3D": g.means,
+        "means2D": torch.zeros_like(g.means),
+        "opacities": g.opacities[:, None],
+        "shs": torch.cat([g.sh0, g.shN], 1),
+        "scales": g.scales,
+        "rotations": torch.nn.functional.normalize(g.quats),
+    }
+
+
 def settings_of(kind, view, **others):
     """The fork's settings for a camera whose principal point is the image's middle."""
     values = {

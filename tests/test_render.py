@@ -15,7 +15,7 @@ from torch.testing import assert_close
 
 import gsplat_versions
 import inria_forks
-from backends import fresh_copy
+from backends import fresh_copy, gsplat_arguments
 from clod_adapter import AttenuationConfig, Hook, bake, order_by_extinction, render, save
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.config import FORMS
@@ -23,7 +23,7 @@ from clod_adapter.equation.attenuation import attenuate, dial
 from clod_adapter.equation.distances import normalized_distances, viewpoint_of
 from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import splat
-from scenes import camera, dialled, gaussians, ring, scene, seeded
+from scenes import camera, dialled, gaussians, ring, seeded
 
 CONFIG = AttenuationConfig(scene_distance=3.0)
 
@@ -184,36 +184,17 @@ def draws(monkeypatch):
     """The drop-ins for gsplat and for Inria's rasterizer, and the renderer, called with arguments
     of the dial alone.
     """
-    given = {**scene(N, 1, 0), "opacities": MODEL.opacities}
-    colors = torch.cat([given.pop("sh0"), given.pop("shN")], 1)
-    points = given["means"]
-    ours = fresh_copy(
-        monkeypatch, "gsplat", "gsplat", gsplat_versions.module("1.5.3")
-    ).rasterization
+    gsplat = fresh_copy(monkeypatch, "gsplat", "gsplat", gsplat_versions.module("1.5.3"))
     fork = inria_forks.module("inria")
     inria = fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", fork)
     of_inria = inria.GaussianRasterizer(
         inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
     )
-    views = {
-        "viewmats": VIEW.viewmat[None],
-        "Ks": VIEW.K[None],
-        "width": VIEW.width,
-        "height": VIEW.height,
-    }
-    rows = {"shs": colors, "scales": given["scales"], "rotations": given["quats"]}
+    plain = gaussians(N, 1, 0)
     return {
-        "gsplat": lambda **dial: ours(**{**given, "colors": colors, "sh_degree": 1} | views | dial),
-        "inria": lambda **dial: of_inria(
-            **{
-                "means3D": points,
-                "means2D": 0 * points,
-                "opacities": given["opacities"][:, None],
-                **rows,
-            }
-            | dial
-        ),
-        "render": lambda **dial: render(gaussians(N, 1, 0), VIEW, **dial),
+        "gsplat": lambda **dial: gsplat.rasterization(**gsplat_arguments(plain, VIEW) | dial),
+        "inria": lambda **dial: of_inria(**inria_forks.arguments_of(plain) | dial),
+        "render": lambda **dial: render(plain, VIEW, **dial),
     }
 
 

@@ -17,13 +17,13 @@ import clod_adapter as clod
 import gsplat_in_torch
 import inria_forks
 import scenes
-from backends import fresh_copy
+from backends import fresh_copy, gsplat_arguments
 from clod_adapter.cameras import intrinsics
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import render
-from inria_forks import FORKS, settings_of
+from inria_forks import FORKS, arguments_of, settings_of
 
 DIAL = 3.0
 VIEW = scenes.camera(48, 32, off_centre=(0.5, 0.5))  # Inria's settings have no principal point
@@ -36,16 +36,7 @@ def through_gsplat(checkpoint, monkeypatch):
 
     g = checkpoint.gaussians
     images, _, _ = rasterization(
-        g.means,
-        g.quats,
-        g.scales,
-        g.opacities,
-        torch.cat([g.sh0, g.shN], 1),
-        VIEW.viewmat[None],
-        VIEW.K[None],
-        VIEW.width,
-        VIEW.height,
-        sh_degree=1,
+        **gsplat_arguments(g, VIEW),
         sigma_d=g.sigma_d,
         growth_d=g.growth_d,
         attenuation=g.attenuation,
@@ -64,16 +55,7 @@ def arguments(g, fork="inria"):
     """A fork's arguments by name, and those of the dial; floating-point tensors require
     gradients.
     """
-    given = {
-        "means3D": g.means,
-        "means2D": torch.zeros_like(g.means),
-        "opacities": g.opacities[:, None],
-        "shs": torch.cat([g.sh0, g.shN], 1),
-        "scales": g.scales,
-        "rotations": torch.nn.functional.normalize(g.quats),
-        "sigma_d": g.sigma_d,
-        "growth_d": g.growth_d,
-    }
+    given = arguments_of(g) | {"sigma_d": g.sigma_d, "growth_d": g.growth_d}
     given = {
         name: value.clone().requires_grad_() for name, value in given.items() if value is not None
     }

@@ -123,23 +123,11 @@ def test_header_of_an_extended_file(tmp_path):
     config = dataclasses.replace(CONFIG, reference_distance=np.float32(0.01), max_sv=3)
     save(tmp_path / "out.ply", base.gaussians.replace(attenuation=config), base, version="7.8.9")
     assert load(tmp_path / "out.ply").gaussians.attenuation == config
-    lines, rows = read_back(tmp_path / "out.ply")
-    assert lines[:4] == [
-        "ply",
-        "format binary_little_endian 1.0",
-        "element vertex 2",
-        "comment a photo",
-    ]
+    lines, _ = read_back(tmp_path / "out.ply")
+    assert lines[3] == "comment a photo" and lines[-1] == "property float sigma_d"
     assert sum("clod_adapter max_sv" in line for line in lines) == 1
     assert not any("odd" in line for line in lines)
-    for line in (
-        f"reference_distance {float(config.reference_distance)!r}",
-        "form paper",
-        "version 7.8.9",
-    ):
-        assert f"comment clod_adapter {line}" in lines
-    assert lines[-1] == "property float sigma_d"
-    assert sorted(rows.dtype.names) == sorted({*rows.dtype.names})
+    assert "comment clod_adapter version 7.8.9" in lines
 
 
 def test_unusable_rows_are_dropped_and_counted(tmp_path):
