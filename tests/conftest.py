@@ -7,7 +7,6 @@ from clod_adapter.cameras import intrinsics
 
 # isort: split
 import math
-import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from common import SHARED
 from filelock import FileLock
 from PIL import Image
 
@@ -53,10 +53,7 @@ def ci_banana():
     """A small real scene of the shared data: CLOD_SHARED_DATA, or shared/data beside the
     checkout.
     """
-    shared = os.environ.get(
-        "CLOD_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"
-    )
-    if not (path := Path(shared) / "ci_banana").exists():
+    if not (path := SHARED / "ci_banana").exists():
         pytest.skip(f"shared data absent: {path} (set CLOD_SHARED_DATA)")
     return path
 

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from clod_adapter import AttenuationConfig, Camera, Gaussians, Scene, View, render
 from clod_adapter.cameras import intrinsics
+from clod_adapter.integrations.splats import to_gsplat
 
 
 def seeded(seed):
@@ -58,6 +59,13 @@ def gaussians(n, degree, seed, *, size=0.08):
     logs = s["scales"].log()
     logits = s["opacities"].logit()
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
+
+
+def splatfacto_parameters(g):
+    """Tensors of the Gaussians with the names and shapes of splatfacto's ``gauss_params``."""
+    named = to_gsplat(g)
+    named |= {"features_dc": named.pop("sh0")[:, 0], "features_rest": named.pop("shN")}
+    return named | {"opacities": named["opacities"][:, None]}
 
 
 def dialled(n, degree, seed, **settings):

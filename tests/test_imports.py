@@ -8,11 +8,10 @@ import sys
 import tomllib
 from graphlib import TopologicalSorter
 from importlib.util import resolve_name
-from pathlib import Path
 
 import pytest
+from common import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "clod_adapter"
 
 # Lowest first. A unit is a module or package of clod_adapter, of clod_adapter/io, or of cli; it

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from common import ROOT
 
 import clod_adapter
 from clod_adapter.cli import adapt
@@ -31,7 +32,6 @@ from clod_adapter.config import AdaptConfig
 from formats import without_comments
 from runs import accepted
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^( *)(`{3,})(\w*)\n(.*?)^\1\2 *$", re.DOTALL | re.MULTILINE)
 

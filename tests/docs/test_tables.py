@@ -8,12 +8,11 @@ import re
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import results
+from common import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = shutil.ignore_patterns("cache", "faults", "images", "__pycache__")
 # of pictures, of bases, and of what has no number
 OTHERS = {"results.py", "pictures.py", "from_points.py", "hostile.py", "faults.py"}

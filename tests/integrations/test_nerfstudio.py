@@ -18,22 +18,20 @@ import copy
 import importlib
 import sys
 import tomllib
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
+from common import ROOT
 from PIL import Image
 from refusals import refused
 
 import gsplat_in_torch
 import scenes
 from clod_adapter import load
-from clod_adapter.integrations.splats import to_gsplat
 from clod_adapter.render import render
 from photographs import write_frames
 
-ROOT = Path(__file__).parents[2]
 N = 60
 WIDTH = 32
 HEIGHT = 24
@@ -108,9 +106,7 @@ def write_splatfacto(config, base, folder):
     pipeline = VanillaPipelineConfig(datamanager=own.datamanager, model=model).setup(
         device="cpu", test_mode="val"
     )
-    values = to_gsplat(base)
-    values |= {"features_dc": values.pop("sh0")[:, 0], "features_rest": values.pop("shN")}
-    for name, value in (values | {"opacities": values["opacities"][:, None]}).items():
+    for name, value in scenes.splatfacto_parameters(base).items():
         pipeline.model.gauss_params[name] = torch.nn.Parameter(value.clone())
     folder.mkdir()
     state = {

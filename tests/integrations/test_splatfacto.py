@@ -32,9 +32,7 @@ BASE = scenes.gaussians(N, 1, 0, size=0.15)
 @pytest.fixture
 def parameters():
     """``BASE`` with the names and shapes of splatfacto's ``gauss_params``."""
-    named = to_gsplat(BASE)
-    named |= {"features_dc": named.pop("sh0")[:, 0], "features_rest": named.pop("shN")}
-    named["opacities"] = named["opacities"][:, None]
+    named = scenes.splatfacto_parameters(BASE)
     return {name: value.clone().requires_grad_() for name, value in named.items()}
 
 

@@ -7,10 +7,10 @@ import re
 from contextlib import closing
 from dataclasses import fields
 from importlib.resources import files
-from pathlib import Path
 
 import pytest
 import torch
+from common import ROOT
 
 import browser
 import clod_adapter
@@ -124,7 +124,6 @@ def test_golden_values_match_the_equation():
         assert my_scale(*row) == pytest.approx(factor, rel=1e-12, abs=1e-300)
 
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "writing_a_renderer.md").read_text(encoding="utf-8")
 
 

@@ -9,17 +9,15 @@ import sys
 import threading
 import time
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from common import ROOT
 
 from clod_adapter._kernels import threads
 from clod_adapter._kernels.memory import IDLE, recycled, release
 from clod_adapter._support.workers import in_order, shared
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_disabled_compilation_is_an_error(capture, tmp_path):

@@ -13,16 +13,14 @@ from clod_adapter.losses import photometric_loss
 from clod_adapter.training.dial import SIGMA_RANGE, attach
 from clod_adapter.training.schedule import OURS, Sample
 from clod_adapter.training.trainer import Trainer
+from scenes import splatfacto_parameters
 
 MAX_SV = 5.0
 
 
 def trainable(base, form="gsplat"):
     """Copies of the Gaussians' tensors as a trainer holds them."""
-    named = clod.to_gsplat(base)
-    if form == "splatfacto":
-        named["features_dc"], named["features_rest"] = named.pop("sh0")[:, 0], named.pop("shN")
-        named["opacities"] = named["opacities"][:, None]
+    named = clod.to_gsplat(base) if form == "gsplat" else splatfacto_parameters(base)
     return torch.nn.ParameterDict(
         {name: torch.nn.Parameter(value.clone()) for name, value in named.items()}
     )

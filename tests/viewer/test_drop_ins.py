@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from common import ROOT
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 from torch.testing import assert_close
@@ -21,7 +22,6 @@ import clod_adapter
 import scenes
 from clod_adapter.equation.attenuation import attenuate
 
-ROOT = Path(__file__).parents[2]
 KIT = ROOT / "viewers" / "kit"
 SIZE = {"width": 192, "height": 144}  # of its pictures
 # Cameras of these viewers look along -z with y up, and the pages turn the splat half a turn about
