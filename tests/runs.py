@@ -4,6 +4,7 @@ interrupts, processes that start fast.
 
 import copy
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -250,3 +251,8 @@ def states_of(steps, found):
             found[progress.done] = copy.deepcopy(progress.state())
 
     return keep
+
+
+def data_in(page, name):
+    """The texts of the elements of a page that hold data, such as ``clod-config``."""
+    return re.findall(rf'id="{name}">(.*?)</script>', page, re.S)

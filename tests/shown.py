@@ -85,8 +85,7 @@ class Shown:
 
     def picture(self):
         """``[H, W, 3]`` uint8 of the splats alone at full resolution."""
-        data = self.run("clod.capture()").partition(",")[2]
-        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
+        return decoded(self.run("clod.capture()").partition(",")[2])
 
     def link(self):
         """The state of the page, as the part of its address that L adds."""
@@ -95,6 +94,11 @@ class Shown:
 
     def counts(self):
         return dict(self.evaluate("clod.whenDrawn().then(clod.counts)"))
+
+
+def decoded(data):
+    """``[H, W, 3]`` uint8 of an image in base64."""
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
 
 def assert_alike(picture, wanted):

@@ -32,6 +32,7 @@ from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_layout import write_comments
 from clod_adapter.io.settings import Metadata
 from formats import inria_rows, with_columns, write_rows
+from runs import data_in
 from scenes import gaussians
 
 EXPORT = "export DIAL --json"
@@ -310,7 +311,7 @@ def test_page_holds_the_splat_and_its_dial(clod, dialled, tmp_path):
         """What was printed, the settings of the page, and the splat in it."""
         done = clod(EXPORT, "-o page.html", *words)
         text = Path("page.html").read_text("utf-8")
-        config, data = re.findall(r'id="clod-(?:model|config)">(.*?)</script>', text)
+        config, data = data_in(text, "clod-(?:model|config)")
         Path(name).write_bytes(base64.b64decode(data))
         return done, json.loads(config), load(name)
 

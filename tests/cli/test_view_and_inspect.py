@@ -16,7 +16,7 @@ from unittest.mock import Mock
 import clod_adapter
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
-from runs import log_of, wait_for
+from runs import data_in, log_of, wait_for
 
 
 def fetch(url):
@@ -26,7 +26,7 @@ def fetch(url):
 
 def config_of(page):
     """The settings that a page holds."""
-    return json.loads(re.findall(r'id="clod-config">(.*?)</script>', page.decode(), re.DOTALL)[0])
+    return json.loads(data_in(page.decode(), "clod-config")[0])
 
 
 def assert_holds(data, file, folder):
@@ -133,10 +133,6 @@ def test_a_dial_and_its_calibration(clod, dialled):
     assert report["command"] == "inspect" and report["path"] == str(dialled)
     assert report["oddities"] == [] and "anomalies" not in report
     assert splat["count"] == splat["total"] == 540
-    assert splat["columns"][-1] == ["opacity_d", "float32"]
-    quantiles = {"least", "low", "median", "high", "greatest"}
-    assert set(splat["sigma"]) == set(splat["growth"]) == quantiles
-    assert splat["dial"]["attenuation"]["max_sv"] == 4 and len(splat["position"]) == 3
     told = json.loads(dialled.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]
     clod("export DIAL --sv 2 -o x.ply")

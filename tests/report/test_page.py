@@ -16,6 +16,7 @@ from refusals import refused
 
 from clod_adapter.report.charts import Series, draw_rows, new_figure, series_of
 from clod_adapter.report.page import Picture, write_page
+from runs import data_in
 
 pytest.importorskip("matplotlib")
 NASTY = r'a <b> & "c" $\co$ </script>'
@@ -76,8 +77,7 @@ def test_page_is_self_contained_and_escaped(tmp_path, monkeypatch):
     assert len(names) == len(set(names)) > 10
     colours = re.findall(r"var\([^)]*\)", text.split("<svg")[1])
     assert {"var(--ink)", "var(--quiet)", "var(--series-1)"} <= set(colours)
-    data = '<script type="application/json" id="data">(.*?)</script>'
-    (stored,) = re.findall(data, text, re.S)
+    (stored,) = data_in(text, "data")
     assert json.loads(stored) == {"report": report(), "training": training} and "<" not in stored
     shown = re.findall(r'<img [^>]*data-name="([^"]*)" data-title', text)
     assert shown == ["", "", "", "photograph"]

@@ -1,8 +1,6 @@
 """The page's text, the page as one file, and its messages."""
 
-import base64
 import hashlib
-import io
 import json
 import re
 from contextlib import closing
@@ -12,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import clod_adapter
 import scenes
@@ -20,8 +17,9 @@ from clod_adapter import load
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.render import render
 from clod_adapter.viewer import page
+from runs import data_in
 from scenes import dialled
-from shown import Shown, assert_same, serve
+from shown import Shown, assert_same, decoded, serve
 
 VIEWER = Path(clod_adapter.__file__).parent / "viewer"
 NAME = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
@@ -69,7 +67,7 @@ def test_the_text_of_one_file(tmp_path):
     assert "unsafe" not in policy[1]
     assert str(tmp_path) not in text
     (poster,) = re.findall('<img id="poster" alt="" src="data:image/jpeg;base64,([^"]*)">', text)
-    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster))), dtype=float)
+    picture = decoded(poster).astype(float)
     wanted = render(shown, cameras[0].resized(512, 256), 2.0).pixels.numpy()
     assert len(poster) < 60_000
     assert picture.shape == wanted.shape
@@ -140,7 +138,7 @@ def test_a_file_without_sigma_d_has_no_dial(show, save, plain):
     """The page shows the reason, and the file's name as text; a name does not end its element."""
     title = f"</script>{NAME}"
     document = page.document(page.page_config([{"name": title}], None, [], 1.0))
-    (config,) = re.findall('id="clod-config">(.*?)</script>', b"".join(document).decode())
+    (config,) = data_in(b"".join(document).decode(), "clod-config")
     assert json.loads(config)["title"] == title
     shown = show(save(plain, NAME))
     assert shown.text("#title") == NAME

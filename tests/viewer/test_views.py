@@ -2,7 +2,6 @@
 pictures, videos.
 """
 
-import base64
 import io
 import re
 from dataclasses import replace
@@ -25,7 +24,7 @@ from clod_adapter.render import render
 from clod_adapter.viewer.page import up_axis, write_viewer_page
 from models import write_model
 from scenes import ring
-from shown import TALL, drop, fold, take
+from shown import TALL, decoded, drop, fold, take
 
 
 def differ(one, other):
@@ -294,10 +293,9 @@ def test_placed_cameras_are_levelled(show, model, tmp_path):
     )
     write_viewer_page(tmp_path / "page.html", replace(saved, calibration=measured))
     poster = re.findall('jpeg;base64,([^"]*)', (tmp_path / "page.html").read_text("utf-8"))
-    picture = Image.open(io.BytesIO(base64.b64decode(poster[0])))
     level = replace(camera_of(place, 400, 300, ""), viewmat=viewmat)
     wanted = render(saved.gaussians, level, 0.0).pixels.numpy()
-    assert peak_signal_noise_ratio(wanted, np.asarray(picture)) > 30
+    assert peak_signal_noise_ratio(wanted, decoded(poster[0])) > 30
     # frames whose time is hardly more than 0
     fast = "WebGL2RenderingContext.prototype.readPixels = () => {}"
     shown = show(url=(tmp_path / "page.html").as_uri(), script=fast)

@@ -3,7 +3,6 @@ of ``--report``.
 """
 
 import json
-import re
 import shutil
 import sys
 from unittest.mock import Mock
@@ -20,7 +19,7 @@ from clod_adapter.cli.shared import inputs, pages
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
 from formats import PACKED
-from runs import names, rebuilt
+from runs import data_in, names, rebuilt
 
 TINY = "--images SCENE --iters 2 --max-sv 4 --out dial.ply"
 
@@ -110,7 +109,7 @@ ADAPT = "BASE --images SCENE --iters 16 --max-sv 4 --out dial.ply --report"
 def page_of(path):
     """Its text, and the data in it."""
     text = path.read_text("utf-8")
-    return text, json.loads(re.findall(r'id="data">(.*?)</script>', text, re.S)[0])
+    return text, json.loads(data_in(text, "data")[0])
 
 
 def test_adapt(clod, tmp_path):
