@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refused
 from safetensors import safe_open
@@ -20,6 +20,7 @@ from clod_adapter import adapter as adapters
 from clod_adapter.adapter import ATTRIBUTES, DIAL, SIGMA_MAX, Adapter, detach, with_dial
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.tensor_file import read_tensors, write_tensors
+from formats import examples
 from scenes import seeded
 
 CONFIG = AttenuationConfig(reference_distance=3.5)
@@ -52,7 +53,7 @@ def adapt(base, names, scale=0.01, seed=1, growth=True):
     return with_dial(base.replace(**changes), sigma_d, CONFIG, growth_d if growth else None)
 
 
-@settings(deadline=None, max_examples=30)
+@examples(30)
 @given(
     st.lists(st.sampled_from(ATTRIBUTES), unique=True),
     st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
@@ -167,9 +168,7 @@ def adapter(n=5, config=None, reference=0.1 / 3):
     )
 
 
-@settings(
-    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@examples(25)
 @given(st.integers(0, 20), st.floats(0, 1e30), st.booleans())
 def test_adapter_round_trips(tmp_path, n, reference, growth):
     first = tmp_path / "a.safetensors"

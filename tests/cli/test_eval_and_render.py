@@ -25,16 +25,6 @@ from clod_adapter.io.checkpoint import load, save
 from runs import names, pressing
 
 EVAL = "eval DIAL --images SCENE --json"
-ROW = {
-    "virtual_scale",
-    "psnr",
-    "ssim",
-    "kept",
-    "kept_share",
-    "in_view",
-    "frame_ms",
-    "frame_ms_range",
-}
 
 
 def test_rows_and_default_dial_values(clod, capture, dialled):
@@ -46,7 +36,7 @@ def test_rows_and_default_dial_values(clod, capture, dialled):
     assert report["model"] == str(dialled) and report["scene"] == str(capture.scene)
     assert report["base_count"] == 300
     for row in report["rows"]:
-        assert set(row) == ROW and row["in_view"] <= row["kept"]
+        assert row["in_view"] <= row["kept"] and row["frame_ms_range"] >= 0
         assert row["kept_share"] == row["kept"] / 300 and row["frame_ms"] > 0
         assert 0 < row["psnr"] < 100 and 0 < row["ssim"] <= 1
     assert "PSNR dB" in done.err and done.out.count("\n") == 1
