@@ -32,7 +32,7 @@ LENGTHS = (1, 2, 3, 5, 7, 10, 20)  # of the table
 SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)  # of the base's Gaussians, where the file is also measured
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument(
@@ -53,7 +53,7 @@ def _setting(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def run(scene: str, label: str, config: clod.AdaptConfig, changed: Row) -> None:
+def run(scene: str, label: str, config: clod.AdaptConfig, changed: Row):
     base, views = checkpoint(scene).gaussians, photographs(scene)
     about = {"scene": scene, "label": label, "changed": changed, "base_count": len(base)}
     (base_row,) = quality(base, views.test, 1.0)

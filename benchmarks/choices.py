@@ -9,7 +9,7 @@ A scene is a folder of the shared data, or one of the demo. Each run adds one ro
 a field of ``schedule.FAR``, or a field of ``AdaptConfig``.
 """
 
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -65,7 +65,7 @@ SHOWN = {  # in the table
 }
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--names", nargs="+", choices=ALTERNATIVES, default=list(ALTERNATIVES))
@@ -86,10 +86,10 @@ def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
     return checkpoint(scene).gaussians, photographs(scene)
 
 
-def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any) -> None:
+def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any):
     """Adapts with one change, and adds the row."""
     make = partial(clod.AdaptConfig, max_sv=MAX_SV)
-    change: AbstractContextManager[Any] = nullcontext()
+    change = nullcontext()
     if hasattr(far, name):
         change = patch.object(far, name, value)
     elif hasattr(FAR, name):

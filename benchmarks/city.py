@@ -150,7 +150,7 @@ def perturb(truth: Gaussians) -> Gaussians:
     return truth
 
 
-def write_city(folder: str | Path, count: int, images: int, width: int, height: int) -> None:
+def write_city(folder: str | Path, count: int, images: int, width: int, height: int):
     """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP
     scene, whole.
     """

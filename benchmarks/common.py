@@ -84,7 +84,7 @@ def about() -> Row:
     return {"commit": commit(), "machine": machine()}
 
 
-def append(file: str, row: Row, record: bool = True) -> None:
+def append(file: str, row: Row, record: bool = True):
     """Prints a row to stderr, and adds it to ``results/<file>`` unless ``record`` is false."""
     text = json.dumps(jsonable({**about(), "benchmark": Path(file).stem, **row}))
     print(text, file=sys.stderr, flush=True)
@@ -188,7 +188,7 @@ class Process:
         seconds, cpu_seconds, peak_bytes: of the whole process, after ``finish``.
     """
 
-    def __init__(self, words: Iterable[object], *, until: str = "") -> None:
+    def __init__(self, words: Iterable[object], *, until: str = ""):
         """Runs to the end, or with ``until`` to a line on stdout that has this text."""
         self.words = [str(word) for word in words]
         self.errors = tempfile.TemporaryFile("w+")  # noqa: SIM115, until it is collected
@@ -214,7 +214,7 @@ class Process:
     def now(self) -> float:
         return time.perf_counter() - self.began
 
-    def finish(self) -> None:
+    def finish(self):
         """Waits for the end; exits where the process failed."""
         _, status, usage = os.wait4(self.process.pid, 0)
         self.seconds = self.now()

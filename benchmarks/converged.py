@@ -19,7 +19,6 @@ from pathlib import Path
 import clod_adapter as clod
 from common import (
     CACHE,
-    Row,
     Table,
     append,
     arguments,
@@ -44,7 +43,7 @@ SHOWN = {  # in the table
 }
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("folders", nargs="+", metavar="FOLDER")
     parser.add_argument(
@@ -76,7 +75,7 @@ def make(source: Path, every: int, start: str | None) -> Path:
     return folder
 
 
-def run(folder: Path, *, record: bool) -> None:
+def run(folder: Path, *, record: bool):
     """Adapts, measures and prints; with ``record`` adds the row to the results."""
     base, scene = clod.load(folder / "base.ply"), clod.load_scene(folder)
     with tempfile.TemporaryDirectory() as place:
@@ -86,7 +85,7 @@ def run(folder: Path, *, record: bool) -> None:
         )
         report = report_of(out)
         rows = quality(clod.load(out).gaussians, scene.test, DIALS)
-    row: Row = {
+    row = {
         "name": folder.name,
         "photographs": len(scene.train),
         "held_out": len(scene.test),

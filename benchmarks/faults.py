@@ -76,7 +76,7 @@ def run(copy: Path, entry: Row) -> tuple[str, str]:
         path.write_text(text, encoding="utf-8")
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("faults", nargs="*", help="ROOM or ROOM/NAME; default: all")
     parser.add_argument("--check", action="store_true", help="only check that each fault applies")

@@ -82,14 +82,14 @@ SHOWN = {  # in the table: the dial, settings, PSNR of the pictures, readers
 }
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     for scene in parser.parse_args().scenes:
         run(scene, clod.AdaptConfig(max_sv=max(DIALS)))
 
 
-def run(scene: str, config: clod.AdaptConfig) -> None:
+def run(scene: str, config: clod.AdaptConfig):
     base, views = checkpoint(scene).gaussians, photographs(scene)
     model = initialize(base, usable_views(base, views.train), config, lambda *_: None)
     cameras = [view.camera for view in views.test]

@@ -34,7 +34,7 @@ OPACITY = 0.3
 SH_COEFFICIENTS = 15
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("photographs", type=Path)
     parser.add_argument("folder", type=Path)
@@ -54,7 +54,7 @@ def main() -> None:
     write_base(args.folder)
 
 
-def find_cameras(photographs: Sequence[Path], size: int, place: Path, folder: Path) -> None:
+def find_cameras(photographs: Sequence[Path], size: int, place: Path, folder: Path):
     """COLMAP's largest model of the photographs, undistorted; ``place`` is for what is made on the
     way.
     """
@@ -75,7 +75,7 @@ def find_cameras(photographs: Sequence[Path], size: int, place: Path, folder: Pa
         file.rename(model / file.name)
 
 
-def thin(source: Path, folder: Path, every: int) -> None:
+def thin(source: Path, folder: Path, every: int):
     """Copies one photograph in ``every`` by name, and the part of the COLMAP model that is of
     these.
     """
@@ -91,7 +91,7 @@ def thin(source: Path, folder: Path, every: int) -> None:
     model.write(str(folder / "sparse" / "0"))
 
 
-def write_base(folder: Path) -> None:
+def write_base(folder: Path):
     """Trains ``folder/base.ply`` from ``images/`` and ``sparse/0/`` there."""
     base = folder / "base.ply"
     views = clod.load_scene(folder).train

@@ -51,7 +51,7 @@ class Size:
 SMALL = Size(count=1000, width=64, height=48, views=4, steps=3, plush_steps=3)
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("--device", choices=["cuda", "cpu"], default="cuda")
     parser.add_argument(

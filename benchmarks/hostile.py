@@ -179,7 +179,7 @@ def options() -> Iterator[Case]:
         yield Case(f"clod-adapt view base.ply --no-browser --port {port}")
 
 
-def write_inputs(folder: Path) -> None:
+def write_inputs(folder: Path):
     """A small town's checkpoint, ``base.ply``, and ten photographs of it, ``scene``."""
     write_city(folder / "scene", 1000, 10, 64, 48)
     (folder / "scene" / "city.ply").rename(folder / "base.ply")
@@ -223,7 +223,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("--only", default="", help="only the lines with this text")
     args = parser.parse_args()

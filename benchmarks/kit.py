@@ -26,7 +26,7 @@ VIEWS = (1, 3)
 WIDTH = 192
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("--demo", default="demo", help="the folder that the demo has written")
     folder = parser.parse_args().demo

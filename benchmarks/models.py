@@ -16,7 +16,7 @@ def write_model(
     names: Sequence[str],
     points: Iterable[np.ndarray] = (),
     colors: Iterable[np.ndarray] = (),
-) -> None:
+):
     """Writes a binary model of pinhole cameras to ``folder/sparse/0``; ``points [M, 3]``,
     ``colors [M, 3]`` uint8.
     """
@@ -44,7 +44,7 @@ def write_photographs(
     pictures: Iterable[np.ndarray],
     points: Iterable[np.ndarray] = (),
     colors: Iterable[np.ndarray] = (),
-) -> None:
+):
     """Writes pictures and their model, as ``write_model`` does, named by their numbers."""
     names = [f"{number:04}.png" for number in range(len(cameras))]
     (folder / "images").mkdir(parents=True)

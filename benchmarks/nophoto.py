@@ -26,7 +26,7 @@ SHOWN = {  # in the table
 MAX_SV = 7.0
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:2])
@@ -40,7 +40,7 @@ def main() -> None:
             run(scene, kind, make(max_sv=MAX_SV), args.few)
 
 
-def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:
+def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None):
     base, photographs = checkpoint(scene).gaussians, photographs_of(scene)
     if few:
         train = photographs.train[:: max(len(photographs.train) // few, 1)][:few]

@@ -29,7 +29,7 @@ SIZE = {"width": 1280, "height": 800}
 DIAL = 3.0
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument(
         "demo", nargs="?", default="demo", help="the folder of clod-adapt demo (default: demo)"
@@ -73,7 +73,7 @@ def viewer(chromium: Any, folder: Path) -> bytes:
         return bytes(shown.page.screenshot(timeout=120_000))
 
 
-def keep(path: Path, picture: bytes) -> None:
+def keep(path: Path, picture: bytes):
     """Writes a screenshot as WebP."""
     with atomic_path(path) as temporary:
         Image.open(io.BytesIO(picture)).convert("RGB").save(temporary, "WEBP", quality=80, method=6)

@@ -117,7 +117,7 @@ def run(name: str, tests: Sequence[str]) -> Row:
     return {"passed": 0, "failed": 1, "skipped": 0, **result, "seconds": seconds}
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("conditions", nargs="*", help="default: each of them; a+b is both at once")
     parser.add_argument(

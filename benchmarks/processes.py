@@ -16,14 +16,14 @@ from common import COMMAND, Process, append, arguments, capture, report_of
 FILE = "processes.jsonl"
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="+")
     for scene in parser.parse_args().scenes:
         run(scene)
 
 
-def run(name: str) -> None:
+def run(name: str):
     torchrun = "-m torch.distributed.run --standalone --nproc-per-node 2 -m clod_adapter"
     runs = {
         "one view": (COMMAND, {"iters": 300, "batch": 1}),

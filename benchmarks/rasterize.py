@@ -42,7 +42,7 @@ Jobs = dict[str, Callable[[], Any]]
 JOBS: Jobs = {}  # of a worker's process
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__, record=FILE)
     parser.add_argument(
         "--accuracy", action="store_true", help="agreement with float64 instead of times"
@@ -74,7 +74,7 @@ def speed() -> list[Row]:
             workers = {"": worker(our_jobs, size)}
             if library:
                 workers["yardstick_"] = worker(yardstick_jobs, size, library)
-            steps: dict[str, list[list[float]]] = {"": [], "yardstick_": []}
+            steps = {"": [], "yardstick_": []}
             for _ in range(REPEATS + WARM):
                 for who, pool in workers.items():
                     steps[who].append(pool.submit(_run, "step").result())
@@ -107,7 +107,7 @@ def worker(make: Callable[..., Jobs], *given: Any) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(1, mp_context=spawn, initializer=_start, initargs=(make, *given))
 
 
-def _start(make: Callable[..., Jobs], *given: Any) -> None:
+def _start(make: Callable[..., Jobs], *given: Any):
     torch.set_num_threads(THREADS)
     JOBS.update(make(*given))
 

@@ -189,7 +189,7 @@ def run(selected: Sequence[Task]) -> int:
 
 def build_pages(write: bool) -> int:
     """Compares the marked tables with their rows, or writes them; 1 if there are problems."""
-    problems: list[str] = []
+    problems = []
     for page in PAGES:
         old = page.read_text("utf-8")
         new = MARKED.sub(partial(rebuilt, page.name, problems, write), old)

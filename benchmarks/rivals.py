@@ -53,7 +53,7 @@ SHOWN = {  # in the table, by rival and end of the label
 }
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--iters", type=int, default=1500, help="steps of tuning")
@@ -141,7 +141,7 @@ def kept(
 def page_table(scene: str) -> Table:
     """PSNR at the shares; the best of each but the whole is bold."""
     (ours,) = last(adapt.FILE, "scene", scene=scene, label=f"max_sv {MAX_SV}").values()
-    found = {label: dict[float, float]() for label in ("ours, one file", *SHOWN.values())}
+    found = {label: {} for label in ("ours, one file", *SHOWN.values())}
     found["ours, one file"] = {point["share"]: point["psnr"] for point in ours["at_shares"]}
     found["pruned"] = {1.0: ours["base"]["psnr"]}
     rows = {}

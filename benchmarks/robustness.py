@@ -18,7 +18,7 @@ CHECKPOINTS = ("pretrained", "pretrained_mask")
 RANGES = (1, 3, 5, 7)
 
 
-def main() -> None:
+def main():
     arguments(__doc__).parse_args()
     folder = capture(SCENE)
     bases = [folder / f"{name}.ply" for name in CHECKPOINTS]

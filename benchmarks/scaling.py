@@ -65,7 +65,7 @@ print(json.dumps({name: round(value, 3) for name, value in spent.items()}))
 """
 
 
-def main() -> None:
+def main():
     arguments(__doc__).parse_args()
     CITIES.mkdir(parents=True, exist_ok=True)
     run_adapt(town(FLOOR))  # compiles the kernels

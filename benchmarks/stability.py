@@ -17,7 +17,7 @@ import stability_popping
 import stability_scenes
 import stability_stiffness
 from clod_adapter.cli.shared.outputs import jsonable
-from common import RESULTS, ROOT, Row, Table, about, arguments, stored
+from common import RESULTS, ROOT, Table, about, arguments, stored
 
 FILE, IMAGES = "stability.jsonl", ROOT / "docs" / "images"
 PARTS = {
@@ -28,13 +28,13 @@ PARTS = {
 }
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument(
         "--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts to run"
     )
     args = parser.parse_args()
-    rows: dict[str, list[Row]] = {part: [] for part in PARTS}
+    rows = {part: [] for part in PARTS}
     for row in stored(FILE):
         rows[row["part"]].append(row)
     for part in args.only:

@@ -36,12 +36,12 @@ BOUNDS = {
 class Tally:
     """Errors of the quantities in one dtype."""
 
-    def __init__(self, dtype: str) -> None:
+    def __init__(self, dtype: str):
         self.dtype = dtype
         self.info = torch.finfo(DTYPES[dtype])
-        self.rows: dict[str, Row] = {}
+        self.rows = {}
 
-    def add(self, name: str, got: float, want: Any, allowed: float, scale: Any = None) -> None:
+    def add(self, name: str, got: float, want: Any, allowed: float, scale: Any = None):
         """Counts the error of a number, relative to it or to ``scale``."""
         row = self.rows.setdefault(
             name,
@@ -70,7 +70,7 @@ class Tally:
 
 
 def measure() -> list[Row]:
-    rows: list[Row] = []
+    rows = []
     for dtype in DTYPES:
         tally = Tally(dtype)
         for k, s in enumerate(DIALS):
@@ -89,7 +89,7 @@ def some_of(random: np.random.Generator, *columns: Any) -> Any:
     return np.choose(random.integers(len(columns), size=POINTS), columns)
 
 
-def check_opacities(tally: Tally, random: np.random.Generator, s: float) -> None:
+def check_opacities(tally: Tally, random: np.random.Generator, s: float):
     """Drawn opacities and gradients, from far inside the reach to just beyond it; what is culled
     must be 0.
     """
@@ -117,7 +117,7 @@ def check_opacities(tally: Tally, random: np.random.Generator, s: float) -> None
         tally.add("its gradient by sigma_d", by_sigma, slope, 6)
 
 
-def check_growth(tally: Tally, random: np.random.Generator, s: float) -> None:
+def check_growth(tally: Tally, random: np.random.Generator, s: float):
     exponents = some_of(random, random.uniform(-1, 3, POINTS), random.uniform(-20, 20, POINTS))
     h = rounded(tally.dtype, exponents)
     d = rounded(tally.dtype, 10.0 ** random.uniform(-2, 4, POINTS))

@@ -232,7 +232,7 @@ def page_table(rows: list[Row]) -> Table:
     """PSNR @ share kept at both ends of the dial, and which cases hold; of cases with one label
     the worst.
     """
-    worst: dict[str, Row] = {}
+    worst = {}
     for case in CASES:
         (row,) = (row for row in rows if row["case"] == case)
         label = TOGETHER.get(case, case)

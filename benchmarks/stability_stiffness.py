@@ -56,7 +56,7 @@ def _torch_optimizer(
     def make(runs: list[Tensor]) -> Stepper:
         optimizer = kind([{"params": [x]} for x in runs], lr=1.0, **settings)
 
-        def step(gradients: list[Tensor], rates: list[float]) -> None:
+        def step(gradients: list[Tensor], rates: list[float]):
             for group, gradient, rate in zip(optimizer.param_groups, gradients, rates, strict=True):
                 group["params"][0].grad, group["lr"] = gradient, rate
             optimizer.step()
@@ -205,7 +205,7 @@ def curves(rows: list[Row], timed: bool) -> dict[tuple[str, str], list[Row]]:
     """Rows by optimizer and parameter: over the learning rates; or, timed, over the steps at the
     best one.
     """
-    lines: dict[tuple[str, str], list[Row]] = {}
+    lines = {}
     for row in rows:
         if row["what"] == "equation" and ("seconds" in row) == timed:
             lines.setdefault((row["optimizer"], row["parameter"]), []).append(row)
@@ -217,7 +217,7 @@ def page_table(rows: list[Row]) -> Table:
     line.
     """
     (start,) = (row["error"] for row in rows if row["what"] == "start")
-    alike: dict[tuple[str, str], list[str]] = {}
+    alike = {}
     for (optimizer, parameter), line in curves(rows, False).items():
         if parameter == "log":
             good = [f"{row['rate']:.2g}" for row in line if row["error"] <= CONVERGED * start]
@@ -231,7 +231,7 @@ def page_table(rows: list[Row]) -> Table:
     return Table(heads, lines, rows)
 
 
-def picture(rows: list[Row], path: Path) -> None:
+def picture(rows: list[Row], path: Path):
     """Error by learning rate on the left, by seconds at the best one on the right; dots for linear
     sigma_d.
     """

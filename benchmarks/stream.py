@@ -51,7 +51,7 @@ SHOWN = {
 Files = dict[float, list[Path]]
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--images", type=Path, help="photographs; without it there are none")
@@ -85,7 +85,7 @@ def of_dial(base: clod.Gaussians, adapted: Path, views: Sequence[clod.View]) -> 
 
 def sets_of(scene: Path, adapted: Path, folder: Path) -> dict[str, Files]:
     """The levels of each set for each multiplier, the finest first."""
-    sets = dict[str, Files]()
+    sets = {}
     for name, option in SETS.items():
         sets[name] = dict.fromkeys(MULTIPLIERS, [scene, *halved(scene, option, folder / name)])
     sets["lod-meta"] = {
@@ -100,7 +100,7 @@ def of_sets(
     """Each set at each budget, with the multiplier that is best there."""
     frames = Frames(base)
     for name, files in sets.items():
-        found = dict[str, Row]()
+        found = {}
         for multiplier, levels in files.items():
             drawn = Levels([clod.load(file).gaussians for file in levels], multiplier, frames)
             for budget in BUDGETS:
@@ -120,7 +120,7 @@ def rendered(base: clod.Gaussians) -> list[clod.View]:
 
 def measured(shown: "Dial | Levels", views: Sequence[clod.View], budget: float, whole: int) -> Row:
     """PSNR over the views, and the mean share drawn."""
-    errors, counts = list[float](), list[int]()
+    errors, counts = [], []
     for view in views:
         gaussians, s, count = shown.frame(view.camera, round(budget * whole))
         with torch.no_grad():
@@ -157,8 +157,8 @@ class Cut(NamedTuple):
 class Frames:
     """The nodes of a scene: a k-d tree of the checkpoint's centres, the same for every set."""
 
-    def __init__(self, base: clod.Gaussians) -> None:
-        self.means, self.leaves = base.means.numpy(), list[np.ndarray]()
+    def __init__(self, base: clod.Gaussians):
+        self.means, self.leaves = base.means.numpy(), []
         self.tree = self._cut(np.arange(len(base)))
         boxes = [self.means[rows] for rows in self.leaves]
         self.low, self.high = (
@@ -196,7 +196,7 @@ class Frames:
 class Levels:
     """A set of levels, the finest first."""
 
-    def __init__(self, levels: list[clod.Gaussians], multiplier: float, frames: Frames) -> None:
+    def __init__(self, levels: list[clod.Gaussians], multiplier: float, frames: Frames):
         self.levels, self.step, self.frames = levels, math.log(multiplier), frames
         self.nodes = [frames.nodes(level.means.numpy()) for level in levels]
         self.counts = np.stack(
@@ -218,7 +218,7 @@ class Levels:
         level = chosen(low)
         shown = [torch.from_numpy(level[nodes] == k) for k, nodes in enumerate(self.nodes)]
         parts = [gaussians.select(rows) for gaussians, rows in zip(self.levels, shown, strict=True)]
-        joined = dict[str, torch.Tensor]()
+        joined = {}
         for name in parts[0].tensors():
             joined[name] = torch.cat([part.tensors()[name] for part in parts])
         return parts[0].replace(**joined), 1.0, int(self.counts[level, every].sum())
@@ -237,7 +237,7 @@ def halved(scene: Path, option: str, folder: Path) -> list[Path]:
 def own_levels(adapted: Path, multiplier: float, folder: Path) -> list[Path]:
     """The levels of ``export --lod-meta``, as splat-transform reads them."""
     clod_adapt("export", adapted, "--lod-meta", "--multiplier", multiplier, "--out", folder)
-    meta, files = folder / "lod-meta.json", list[Path]()
+    meta, files = folder / "lod-meta.json", []
     for level in range(int(json.loads(meta.read_text("utf-8"))["lodLevels"])):
         files.append(folder / f"level{level}.ply")
         find_tool().run("-q", meta, "-L", str(level), files[-1], timeout=TIMEOUT)
@@ -247,8 +247,8 @@ def own_levels(adapted: Path, multiplier: float, folder: Path) -> list[Path]:
 def page_table(scene: str) -> Table:
     """The methods at each budget; the best is bold."""
     found = last(FILE, "method", "level", scene=scene)
-    rows: list[Row] = []
-    lines: dict[str, list[float | None]] = {}
+    rows = []
+    lines = {}
     for method, label in SHOWN.items():
         line = [found[key] for budget in BUDGETS if (key := (method, f"{budget:.0%}")) in found]
         rows += line

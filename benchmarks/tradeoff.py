@@ -33,7 +33,7 @@ LABELS = {
 }
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("scene", help="a folder of the shared data")
     parser.add_argument("--plot", action="store_true", help="only draw the stored rows")
@@ -109,7 +109,7 @@ def counts(scene: str) -> list[int]:
 def curves(scene: str, k: int) -> list[Row]:
     """Lines by method at the k-th dial value, by rising time; of equal runs the last."""
     runs = last(FILE, "method", "iters", scene=scene)
-    points: dict[str, list[Row]] = {method: [] for method in LABELS}
+    points = {method: [] for method in LABELS}
     for (method, _), row in sorted(runs.items()):
         point = row["rows"][k]
         points[method].append(
@@ -122,7 +122,7 @@ def curves(scene: str, k: int) -> list[Row]:
     ]
 
 
-def plot(scene: str) -> None:
+def plot(scene: str):
     """A panel a dial value: error against seconds of training."""
     base = stored(FILE)[-1]["base"]
     with new_figure((4.6 * len(DIALS), 4.3), layout="constrained") as figure:

@@ -66,7 +66,7 @@ def tune(
     optimizer = RowAdam({name: parameters[name] for name in tuned})
     random = np.random.default_rng(config.seed)
     all_rows = torch.ones(len(start), dtype=torch.bool)
-    order: list[int] = []
+    order = []
     prefix = len(start) if config.prefixes else None
     _gradients(start, parameters, tuned, views[0], prefix)  # compiled before the clock starts
     began = time.perf_counter()

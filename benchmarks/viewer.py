@@ -25,7 +25,7 @@ DIALS = (1.0, 3.0, 5.0)
 CAMERAS = 4
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("captures", nargs="*", default=CAPTURES)
     with browser.launch() as chromium:

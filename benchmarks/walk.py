@@ -38,7 +38,7 @@ SAMPLES = 2  # along each side of a pixel of a photograph
 BANDS = {"within 12 m": 12.0, "12 to 40 m": 40.0, "40 to 120 m": 120.0, "beyond": math.inf}
 
 
-def main() -> None:
+def main():
     parser = arguments(__doc__, record=FILE)
     append(FILE, measure(COUNT), parser.parse_args().record)
 
@@ -51,7 +51,7 @@ def measure(count: int) -> Row:
         out = Path(place) / "dial.ply"
         run = clod_adapt(base, "--images", folder, "--out", out, "--json", "--accept-loss")
         models = {"base": clod.load(base).gaussians, "dial": clod.load(out).gaussians}
-    row: Row = {
+    row = {
         "count": count,
         "steps": json.loads(run.out)["steps"],
         **run.cost(),
