@@ -8,14 +8,11 @@ base and the dial.
 """
 
 import ast
-from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import product
-from typing import Any
 
 import clod_adapter as clod
 from common import (
-    Row,
     Table,
     append,
     arguments,
@@ -45,7 +42,7 @@ def main():
         run(scene, args.label, clod.AdaptConfig(**changed), changed)
 
 
-def _setting(text: str) -> tuple[str, Any]:
+def _setting(text):
     name, _, value = text.partition("=")
     try:
         return name, ast.literal_eval(value)
@@ -53,16 +50,14 @@ def _setting(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def run(scene: str, label: str, config: clod.AdaptConfig, changed: Row):
+def run(scene, label, config, changed):
     base, views = checkpoint(scene).gaussians, photographs(scene)
     about = {"scene": scene, "label": label, "changed": changed, "base_count": len(base)}
     (base_row,) = quality(base, views.test, 1.0)
     append(FILE, {**about, "base": base_row, **adapted(base, views, views.test, config)})
 
 
-def adapted(
-    base: clod.Gaussians, views: clod.Scene, shown: Sequence[clod.View], config: clod.AdaptConfig
-) -> Row:
+def adapted(base, views, shown, config):
     """Adapts to ``views``, and measures on the views ``shown``."""
     dials = sorted({s for s in DIALS if s < config.max_sv} | {config.max_sv})
     plan = clod.make_plan(base, views, config)
@@ -78,7 +73,7 @@ def adapted(
     }
 
 
-def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[Row]:
+def at_shares(model, views):
     """Rows at the dial values that keep SHARES of the Gaussians, as far as the dial goes."""
     cameras = [view.camera for view in views]
     rows = []
@@ -93,7 +88,7 @@ def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[Row]:
     return rows
 
 
-def page_table() -> Table:
+def page_table():
     """Dials of two lengths on two captures."""
     found = last(FILE, "scene", "label")
     shown = {}

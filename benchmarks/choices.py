@@ -78,7 +78,7 @@ def main():
                 measure(scene, base, views, name, value)
 
 
-def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
+def opened(scene):
     """The checkpoint and the views to train and to measure on."""
     demo = Path(scene) / "base.ply"
     if demo.exists():
@@ -86,7 +86,7 @@ def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
     return checkpoint(scene).gaussians, photographs(scene)
 
 
-def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any):
+def measure(scene, base, views, name, value):
     """Adapts with one change, and adds the row."""
     make = partial(clod.AdaptConfig, max_sv=MAX_SV)
     change = nullcontext()
@@ -102,7 +102,7 @@ def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, valu
     append(FILE, about | row)
 
 
-def page_table() -> Table:
+def page_table():
     """The choices of SHOWN on three captures."""
     scenes, shares = ("plush_half", "demo", "ci_banana"), (0.35, 0.12)
     found = last(FILE, "scene", "choice", "value")

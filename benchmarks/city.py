@@ -6,7 +6,6 @@ picture, in metres; the ground is y = 0.
 """
 
 import math
-from pathlib import Path
 from typing import Literal
 
 import clod_adapter as clod
@@ -28,12 +27,12 @@ SKY = 0.03  # share of the Gaussians
 PERTURBED = {"means": 0.02, "log_scales": 0.15, "opacity_logits": 0.5, "sh0": 0.12}
 
 
-def lots(count: int) -> int:
+def lots(count):
     """Houses along a side of the town."""
     return max(math.ceil(math.sqrt(count / (DENSITY * AREA))), 1)
 
 
-def city(count: int) -> Gaussians:
+def city(count):
     """``count`` Gaussians, at least 1000; always the same ones."""
     if count < 1000:
         raise SystemExit(f"a town needs at least 1000 Gaussians, not {count}")
@@ -59,7 +58,7 @@ def city(count: int) -> Gaussians:
     return Gaussians(*(torch.from_numpy(values).float() for values in attributes))
 
 
-def surfaces(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def surfaces(count, random):
     """Points, normals and colours on the plain and on the houses' walls and roofs."""
     side = lots(count)
     lot = random.integers(0, side**2, count)
@@ -83,7 +82,7 @@ def surfaces(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.nd
     return points, normals, colours.clip(0.02, 0.98)
 
 
-def facing(normals: np.ndarray) -> np.ndarray:
+def facing(normals):
     """Quaternions that turn z to the normals."""
     x, y, z = normals.T
     quats = np.stack([1 + z, -y, x, 0 * x], 1)
@@ -91,9 +90,7 @@ def facing(normals: np.ndarray) -> np.ndarray:
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-def city_cameras(
-    n: int, width: int, height: int, *, where: Where = "mixed", count: int, seed: int = 0
-) -> list[clod.Camera]:
+def city_cameras(n, width, height, *, where="mixed", count, seed=0):
     """``n`` cameras, named ``view_0000.png`` on: "near" in the streets, "far" in the air, or the
     two in turn.
     """
@@ -117,13 +114,13 @@ def city_cameras(
     return cameras
 
 
-def direction(turn: float, rise: float) -> np.ndarray:
+def direction(turn, rise):
     """A unit vector, by radians about the vertical and above the ground."""
     level = math.cos(rise)
     return np.array([level * math.cos(turn), -math.sin(rise), level * math.sin(turn)])
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> clod.Camera:
+def look_at(eye, target, width, height, name):
     """An upright camera with ``target`` in the middle of its image, and 65 degrees across it."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
@@ -136,7 +133,7 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
     return clod.Camera(torch.from_numpy(viewmat).float(), K, width, height, name)
 
 
-def perturb(truth: Gaussians) -> Gaussians:
+def perturb(truth):
     """A checkpoint with the errors of training: the truth slightly blurred and displaced. In place;
     returned.
     """
@@ -150,7 +147,7 @@ def perturb(truth: Gaussians) -> Gaussians:
     return truth
 
 
-def write_city(folder: str | Path, count: int, images: int, width: int, height: int):
+def write_city(folder, count, images, width, height):
     """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP
     scene, whole.
     """

@@ -26,7 +26,7 @@ COMMAND = (sys.executable, "-m", "clod_adapter.cli.main")
 Row = dict[str, Any]
 
 
-def arguments(doc: str | None, *, record: str = "") -> argparse.ArgumentParser:
+def arguments(doc, *, record=""):
     """A parser with the module's docstring, and with ``--record`` for a file of results."""
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -38,7 +38,7 @@ def arguments(doc: str | None, *, record: str = "") -> argparse.ArgumentParser:
     return parser
 
 
-def capture(name: str) -> Path:
+def capture(name):
     """The folder of a capture; exits with a message where the shared data is absent."""
     folder = SHARED / name
     if not folder.is_dir():
@@ -46,22 +46,22 @@ def capture(name: str) -> Path:
     return folder
 
 
-def checkpoint(scene: str) -> clod.Checkpoint:
+def checkpoint(scene):
     """``FOLDER/pretrained.ply``, or ``FOLDER/NAME.ply`` of a scene ``FOLDER/NAME``."""
     folder, _, name = scene.partition("/")
     return clod.load(capture(folder) / f"{name or 'pretrained'}.ply")
 
 
-def photographs(scene: str) -> clod.Scene:
+def photographs(scene):
     return clod.load_scene(capture(scene.partition("/")[0]))
 
 
-def quality(gaussians: clod.Gaussians, views: Sequence[clod.View], dials: Any) -> list[Row]:
+def quality(gaussians, views, dials):
     """``clod.evaluate`` at one or more dial values, as rows of results."""
     return [row.as_dict() for row in clod.evaluate(gaussians, views, dials)]
 
 
-def commit() -> str:
+def commit():
     """The last commit of the package that is measured, with a + where it or the benchmarks differ;
     empty without git. Commits of rows and pages do not change it.
     """
@@ -69,7 +69,7 @@ def commit() -> str:
     if not shutil.which("git") or not (checkout / ".git").exists():
         return ""
 
-    def git(*words: str) -> str:
+    def git(*words):
         return subprocess.run(
             ["git", *words], cwd=checkout, capture_output=True, text=True, check=True
         ).stdout.strip()
@@ -79,12 +79,12 @@ def commit() -> str:
     return git("log", "-1", "--format=%h", *measured) + ("+" if changed else "")
 
 
-def about() -> Row:
+def about():
     """Commit and machine of a row."""
     return {"commit": commit(), "machine": machine()}
 
 
-def append(file: str, row: Row, record: bool = True):
+def append(file, row, record=True):
     """Prints a row to stderr, and adds it to ``results/<file>`` unless ``record`` is false."""
     text = json.dumps(jsonable({**about(), "benchmark": Path(file).stem, **row}))
     print(text, file=sys.stderr, flush=True)
@@ -94,14 +94,14 @@ def append(file: str, row: Row, record: bool = True):
             out.write(text + "\n")
 
 
-def stored(file: str) -> list[Row]:
+def stored(file):
     """The rows of ``results/<file>``."""
     path = RESULTS / file
     lines = path.read_text("utf-8").splitlines() if path.exists() else []
     return [json.loads(line) for line in lines]
 
 
-def last(file: str, *names: str, **where: object) -> dict[tuple[Any, ...], Row]:
+def last(file, *names, **where):
     """The last row of each combination of these values, among the rows that have those of
     ``where``.
     """
@@ -123,7 +123,7 @@ class Table:
     rows: Iterable[Row]
     numbers_from: int | None = None
 
-    def markdown(self) -> str:
+    def markdown(self):
         left = len(self.heads) if self.numbers_from is None else self.numbers_from
         marks = ["---"] * left + ["---:"] * (len(self.heads) - left)
         lines = [f"| {' | '.join(map(str, cells))} |" for cells in (self.heads, *self.lines)]
@@ -131,20 +131,20 @@ class Table:
         return "\n".join(lines).replace("  ", " ")
 
 
-def psnr_kept(row: Row) -> str:
+def psnr_kept(row):
     return f"{row['psnr']:.2f} @ {100 * row['kept_share']:.0f} %"
 
 
-def psnr_at(points: Iterable[Row], share: float) -> str:
+def psnr_at(points, share):
     """PSNR of the point with this share; empty where there is none."""
     return "".join(f"{point['psnr']:.2f}" for point in points if point["share"] == share)
 
 
-def percent(shares: Iterable[float]) -> list[str]:
+def percent(shares):
     return [f"{100 * share:.0f} %" for share in shares]
 
 
-def by_scene(scenes: Iterable[str], shares: Sequence[float]) -> list[str]:
+def by_scene(scenes, shares):
     """Heads: s = 1 and the shares of each scene."""
     heads = []
     for scene in scenes:
@@ -152,7 +152,7 @@ def by_scene(scenes: Iterable[str], shares: Sequence[float]) -> list[str]:
     return heads
 
 
-def with_best(lines: dict[str, list[float | None]], form: str) -> list[list[str]]:
+def with_best(lines, form):
     """The lines with their labels, in which the largest number of each column is bold."""
     best = [max(filter(None, column)) for column in zip(*lines.values(), strict=True)]
     written = []
@@ -165,7 +165,7 @@ def with_best(lines: dict[str, list[float | None]], form: str) -> list[list[str]
     return written
 
 
-def outcomes(report: Path) -> Row:
+def outcomes(report):
     """Counts of a JUnit report, and the names of the tests that failed."""
     root = xml.parse(report).getroot()
     bad = {*root.iterfind(".//testcase[failure]"), *root.iterfind(".//testcase[error]")}
@@ -188,7 +188,7 @@ class Process:
         seconds, cpu_seconds, peak_bytes: of the whole process, after ``finish``.
     """
 
-    def __init__(self, words: Iterable[object], *, until: str = ""):
+    def __init__(self, words, *, until=""):
         """Runs to the end, or with ``until`` to a line on stdout that has this text."""
         self.words = [str(word) for word in words]
         self.errors = tempfile.TemporaryFile("w+")  # noqa: SIM115, until it is collected
@@ -211,7 +211,7 @@ class Process:
                 return
         self.finish()
 
-    def now(self) -> float:
+    def now(self):
         return time.perf_counter() - self.began
 
     def finish(self):
@@ -226,16 +226,16 @@ class Process:
             said = self.errors.read().rstrip()
             sys.exit(f"exit code {self.process.returncode}: {' '.join(self.words)}\n{said}")
 
-    def cost(self) -> Row:
+    def cost(self):
         times = {"seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
         return times | {"peak_bytes": self.peak_bytes}
 
 
-def report_of(out: Path) -> Row:
+def report_of(out):
     """The report that the command writes beside an adapted file."""
     return json.loads(out.with_suffix(".json").read_text("utf-8"))
 
 
-def clod_adapt(*words: object, until: str = "") -> Process:
+def clod_adapt(*words, until=""):
     """The command with these words, in a process of its own."""
     return Process([*COMMAND, *words], until=until)

@@ -58,7 +58,7 @@ def main():
         run(folder, record=args.record)
 
 
-def make(source: Path, every: int, start: str | None) -> Path:
+def make(source, every, start):
     """The folder of the thinned capture with its base, made now if it is not in the cache."""
     folder = CACHE / f"{source.name}-{every}-{Path(start or 'points').stem}"
     base = folder / "base.ply"
@@ -75,7 +75,7 @@ def make(source: Path, every: int, start: str | None) -> Path:
     return folder
 
 
-def run(folder: Path, *, record: bool):
+def run(folder, *, record):
     """Adapts, measures and prints; with ``record`` adds the row to the results."""
     base, scene = clod.load(folder / "base.ply"), clod.load_scene(folder)
     with tempfile.TemporaryDirectory() as place:
@@ -98,7 +98,7 @@ def run(folder: Path, *, record: bool):
     append(FILE, row, record)
 
 
-def page_table() -> Table:
+def page_table():
     """Bases that were trained on few photographs alone."""
     rows, lines = [], []
     for (name,), row in last(FILE, "name").items():

@@ -17,10 +17,9 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from common import ROOT, SHARED, Row, append, arguments
+from common import ROOT, SHARED, append, arguments
 
 FILE = "faults.jsonl"
 LISTS = ROOT / "benchmarks" / "faults"
@@ -29,7 +28,7 @@ LEFT_OUT = shutil.ignore_patterns(
 )
 
 
-def faults(words: Sequence[str]) -> Iterator[tuple[str, Row]]:
+def faults(words):
     """The faults named, all without words: ``ROOM/NAME`` and the entry."""
     for path in sorted(LISTS.glob("*.toml")):
         for entry in tomllib.loads(path.read_text(encoding="utf-8"))["fault"]:
@@ -38,7 +37,7 @@ def faults(words: Sequence[str]) -> Iterator[tuple[str, Row]]:
                 yield name, entry
 
 
-def misfits(words: Sequence[str]) -> list[str]:
+def misfits(words):
     """A line for each of the faults that no longer applies."""
     lines = []
     for name, entry in faults(words):
@@ -49,7 +48,7 @@ def misfits(words: Sequence[str]) -> list[str]:
     return lines
 
 
-def first_failure(copy: Path, tests: Sequence[str]) -> tuple[str, str]:
+def first_failure(copy, tests):
     """The first test that fails in the copy, or the run's error, empty where all pass; and pytest's
     last line.
     """
@@ -65,7 +64,7 @@ def first_failure(copy: Path, tests: Sequence[str]) -> tuple[str, str]:
     return next(failed, lines[-1]) if done.returncode else "", lines[-1]
 
 
-def run(copy: Path, entry: Row) -> tuple[str, str]:
+def run(copy, entry):
     """What catches the fault, and the counts, as by ``first_failure``."""
     path = copy / entry["file"]
     text = path.read_text(encoding="utf-8")

@@ -10,7 +10,6 @@ model baked at s is written and compared. Each format adds one row to ``results/
 
 import math
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -18,7 +17,7 @@ import clod_adapter as clod
 from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
 from clod_adapter.losses import decibels
-from common import Row, Table, append, arguments, checkpoint, last, photographs
+from common import Table, append, arguments, checkpoint, last, photographs
 
 import torch
 
@@ -89,7 +88,7 @@ def main():
         run(scene, clod.AdaptConfig(max_sv=max(DIALS)))
 
 
-def run(scene: str, config: clod.AdaptConfig):
+def run(scene, config):
     base, views = checkpoint(scene).gaussians, photographs(scene)
     model = initialize(base, usable_views(base, views.train), config, lambda *_: None)
     cameras = [view.camera for view in views.test]
@@ -107,7 +106,7 @@ def run(scene: str, config: clod.AdaptConfig):
         append(FILE, row)
 
 
-def round_trip(path: Path, gaussians: clod.Gaussians) -> Row:
+def round_trip(path, gaussians):
     """The size, and the largest relative error of sigma_d, of those of at least 1e-4."""
     notes = write(path, gaussians)
     again = clod.load(path).gaussians
@@ -127,9 +126,7 @@ def round_trip(path: Path, gaussians: clod.Gaussians) -> Row:
 
 
 @torch.no_grad()
-def pictures(
-    gaussians: clod.Gaussians, again: clod.Gaussians, cameras: Sequence[clod.Camera], s: float
-) -> Row:
+def pictures(gaussians, again, cameras, s):
     """PSNR between the two, the mean over the views."""
     found = []
     for camera in cameras:
@@ -142,7 +139,7 @@ def pictures(
     return {"psnr": round(mean, 2) if mean < math.inf else None}
 
 
-def page_table() -> Table:
+def page_table():
     """Bytes, errors and PSNR over the captures."""
     found, lines = last(FILE, "suffix", "scene"), []
     for suffix, (dial, settings, pictures, readers) in SHOWN.items():
@@ -162,7 +159,7 @@ def page_table() -> Table:
     return Table(HEADS, lines, found.values())
 
 
-def span(values: Sequence[float]) -> str:
+def span(values):
     return " to ".join(dict.fromkeys((f"{min(values):.0f}", f"{max(values):.0f}")))
 
 

@@ -11,7 +11,6 @@ ones, as in 3DGS as Markov Chain Monte Carlo (arXiv 2404.09591).
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import clod_adapter as clod
@@ -54,7 +53,7 @@ def main():
     write_base(args.folder)
 
 
-def find_cameras(photographs: Sequence[Path], size: int, place: Path, folder: Path):
+def find_cameras(photographs, size, place, folder):
     """COLMAP's largest model of the photographs, undistorted; ``place`` is for what is made on the
     way.
     """
@@ -75,7 +74,7 @@ def find_cameras(photographs: Sequence[Path], size: int, place: Path, folder: Pa
         file.rename(model / file.name)
 
 
-def thin(source: Path, folder: Path, every: int):
+def thin(source, folder, every):
     """Copies one photograph in ``every`` by name, and the part of the COLMAP model that is of
     these.
     """
@@ -91,7 +90,7 @@ def thin(source: Path, folder: Path, every: int):
     model.write(str(folder / "sparse" / "0"))
 
 
-def write_base(folder: Path):
+def write_base(folder):
     """Trains ``folder/base.ply`` from ``images/`` and ``sparse/0/`` there."""
     base = folder / "base.ply"
     views = clod.load_scene(folder).train
@@ -107,7 +106,7 @@ def write_base(folder: Path):
     print(f"{base}: trained in {seconds + taken:.0f} s", file=sys.stderr)
 
 
-def initial(model: pycolmap.Reconstruction, random: np.random.Generator) -> clod.Gaussians:
+def initial(model, random):
     """COUNT Gaussians at points of the model, each displaced by as much as its neighbours are
     away.
     """
@@ -128,7 +127,7 @@ def initial(model: pycolmap.Reconstruction, random: np.random.Generator) -> clod
     )
 
 
-def relocated(gaussians: clod.Gaussians, random: np.random.Generator) -> clod.Gaussians:
+def relocated(gaussians, random):
     """Transparent Gaussians become copies of opaque ones, chosen by opacity; both have half the
     optical depth.
     """

@@ -74,12 +74,12 @@ def main():
             append(args.results, {**about, **row})
 
 
-def run_tests(device: torch.device, size: Size, small: bool) -> list[Row]:
+def run_tests(device, size, small):
     """Counts of passed, failed and skipped tests, and the names of failed ones."""
     return [portability.run("plain", TESTS[-1:] if small else TESTS)]
 
 
-def adapt_plush(device: torch.device, size: Size, small: bool) -> list[Row]:
+def adapt_plush(device, size, small):
     """A row a device."""
     if small:
         base, scene = synthetic(size, torch.device("cpu"))
@@ -106,9 +106,7 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[Row]:
     return rows
 
 
-def timed_adapt(
-    base: clod.Gaussians, scene: clod.Scene, config: clod.AdaptConfig
-) -> tuple[clod.Gaussians, Row]:
+def timed_adapt(base, scene, config):
     device = base.means.device
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
@@ -123,7 +121,7 @@ def timed_adapt(
     return adapted.gaussians, cost
 
 
-def measure_city(device: torch.device, size: Size, small: bool) -> list[Row]:
+def measure_city(device, size, small):
     """A row for the adaptation, and one for each of near and far at each dial value."""
     base, scene = synthetic(size, device)
     base = base.to(device)
@@ -140,7 +138,7 @@ def measure_city(device: torch.device, size: Size, small: bool) -> list[Row]:
     return rows
 
 
-def frames(model: clod.Gaussians, views: list[clod.View], where: str) -> list[Row]:
+def frames(model, views, where):
     """Milliseconds of the dial values and of the file without its dial, in turn over the views; and
     PSNR of the pictures, against the truth and against that file.
     """
@@ -158,7 +156,7 @@ def frames(model: clod.Gaussians, views: list[clod.View], where: str) -> list[Ro
     return rows
 
 
-def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Scene]:
+def synthetic(size, device):
     """A perturbed city, and photographs of the unperturbed one."""
     truth = city(size.count)
     cameras = city_cameras(2 * size.views, size.width, size.height, where="mixed", count=size.count)
@@ -167,14 +165,12 @@ def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Sc
 
 
 @torch.no_grad()
-def photograph(
-    truth: clod.Gaussians, cameras: list[clod.Camera], device: torch.device
-) -> list[clod.View]:
+def photograph(truth, cameras, device):
     truth = truth.to(device)
     return [clod.View(camera, clod.render(truth, camera).pixels.cpu()) for camera in cameras]
 
 
-def peak(device: torch.device) -> int:
+def peak(device):
     """Bytes: of torch's allocations on a GPU since the last reset; on the CPU of the process,
     ever.
     """

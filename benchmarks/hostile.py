@@ -13,7 +13,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -47,7 +46,7 @@ class Case:
     told: bool = True
 
 
-def streams() -> Iterator[Case]:
+def streams():
     yield Case("clod-adapt --version >&-")
     yield Case("clod-adapt --help >/dev/full")
     for stdout in (">&-", "--json >&-", "--json >/dev/full"):
@@ -150,19 +149,19 @@ EXPORT = """
 """
 
 
-def of_lines(command: str, lines: str) -> Iterator[Case]:
+def of_lines(command, lines):
     """The command with the words of each line, all refused."""
     for words in lines.strip().splitlines():
         yield Case(f"{command} {words}")
 
 
-def environments() -> Iterator[Case]:
+def environments():
     for variables in VARIABLES.strip().splitlines():
         yield Case(f"env {variables} clod-adapt {EVAL}", 0)
     yield Case(f"env TMPDIR=/missing HOME=/missing clod-adapt {SCENE}", 0, FILES)
 
 
-def folders() -> Iterator[Case]:
+def folders():
     yield Case("mkdir gone; cd gone; rmdir ../gone; clod-adapt inspect ../base.ply")
     yield from of_lines("clod-adapt", PATHS)
     yield Case("mkfifo p.ply; timeout 20 clod-adapt inspect p.ply; code=$?; rm p.ply; exit $code")
@@ -171,7 +170,7 @@ def folders() -> Iterator[Case]:
     )
 
 
-def options() -> Iterator[Case]:
+def options():
     yield from of_lines("clod-adapt base.ply --images scene -o new.ply", ADAPT)
     yield from of_lines("clod-adapt eval base.ply --images scene", EVALUATE)
     yield from of_lines("clod-adapt export base.ply -o new.ply", EXPORT)
@@ -179,13 +178,13 @@ def options() -> Iterator[Case]:
         yield Case(f"clod-adapt view base.ply --no-browser --port {port}")
 
 
-def write_inputs(folder: Path):
+def write_inputs(folder):
     """A small town's checkpoint, ``base.ply``, and ten photographs of it, ``scene``."""
     write_city(folder / "scene", 1000, 10, 64, 48)
     (folder / "scene" / "city.ply").rename(folder / "base.ply")
 
 
-def failures(case: Case, inputs: Path) -> list[str]:
+def failures(case, inputs):
     """What is wrong with the case, in a copy of the inputs."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -218,7 +217,7 @@ def failures(case: Case, inputs: Path) -> list[str]:
     return [*wrong, *lines[-5:]] if wrong else []
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     files = (path for path in folder.rglob("*") if path.is_file())
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 

@@ -13,7 +13,7 @@ import math
 
 import clod_adapter as clod
 from clod_adapter.cameras import intrinsics
-from common import ROOT, Row, arguments
+from common import ROOT, arguments
 
 import torch
 from PIL import Image
@@ -44,7 +44,7 @@ def main():
     (KIT / "cameras.json").write_text(json.dumps(about, indent=1) + "\n")
 
 
-def resized(camera: clod.Camera) -> clod.Camera:
+def resized(camera):
     """The camera with WIDTH square pixels and the principal point in the middle, as viewers have
     it.
     """
@@ -54,7 +54,7 @@ def resized(camera: clod.Camera) -> clod.Camera:
     return clod.Camera(camera.viewmat, K, WIDTH, height)
 
 
-def pictured(gaussians: clod.Gaussians, number: int, camera: clod.Camera) -> Row:
+def pictured(gaussians, number, camera):
     """Writes the pictures of a camera; what cameras.json has of it."""
     camera = resized(camera)
     frames = []

@@ -1,21 +1,16 @@
 """Writes COLMAP models of synthetic scenes, for the benchmarks and the tests."""
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
-
-from clod_adapter.cameras import Camera
-
 import numpy as np
 import pycolmap
 from PIL import Image
 
 
 def write_model(
-    folder: Path,
-    cameras: Sequence[Camera],
-    names: Sequence[str],
-    points: Iterable[np.ndarray] = (),
-    colors: Iterable[np.ndarray] = (),
+    folder,
+    cameras,
+    names,
+    points=(),
+    colors=(),
 ):
     """Writes a binary model of pinhole cameras to ``folder/sparse/0``; ``points [M, 3]``,
     ``colors [M, 3]`` uint8.
@@ -39,11 +34,11 @@ def write_model(
 
 
 def write_photographs(
-    folder: Path,
-    cameras: Sequence[Camera],
-    pictures: Iterable[np.ndarray],
-    points: Iterable[np.ndarray] = (),
-    colors: Iterable[np.ndarray] = (),
+    folder,
+    cameras,
+    pictures,
+    points=(),
+    colors=(),
 ):
     """Writes pictures and their model, as ``write_model`` does, named by their numbers."""
     names = [f"{number:04}.png" for number in range(len(cameras))]

@@ -40,7 +40,7 @@ def main():
             run(scene, kind, make(max_sv=MAX_SV), args.few)
 
 
-def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None):
+def run(scene, kind, config, few):
     base, photographs = checkpoint(scene).gaussians, photographs_of(scene)
     if few:
         train = photographs.train[:: max(len(photographs.train) // few, 1)][:few]
@@ -56,7 +56,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None):
     append(FILE, about | adapted(base, views, photographs.test, config))
 
 
-def page_table() -> Table:
+def page_table():
     """PSNR by the views that are trained on."""
     scenes, shares = ("plush_half", "bonsai146"), (0.35, 0.12)
     found = last(FILE, "scene", "kind")

@@ -11,7 +11,6 @@ import io
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.demo import TITLE, VIEW, compared, dial_strip, merging
@@ -40,7 +39,7 @@ def main():
         keep(IMAGES / "viewer.webp", viewer(chromium, folder))
 
 
-def dial(folder: Path) -> bytes:
+def dial(folder):
     """The strip of the demo."""
     base, model = (clod.load(folder / name).gaussians for name in ("base.ply", "gallery.ply"))
     scene = clod.load_scene(folder / "capture")
@@ -51,7 +50,7 @@ def dial(folder: Path) -> bytes:
         return file.read_bytes()
 
 
-def viewer(chromium: Any, folder: Path) -> bytes:
+def viewer(chromium, folder):
     """The page in dark."""
     capture = folder / "capture"
     camera = clod.load_scene(capture).test[VIEW].camera
@@ -73,7 +72,7 @@ def viewer(chromium: Any, folder: Path) -> bytes:
         return bytes(shown.page.screenshot(timeout=120_000))
 
 
-def keep(path: Path, picture: bytes):
+def keep(path, picture):
     """Writes a screenshot as WebP."""
     with atomic_path(path) as temporary:
         Image.open(io.BytesIO(picture)).convert("RGB").save(temporary, "WEBP", quality=80, method=6)

@@ -29,12 +29,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
 
-from common import ROOT, SHARED, Row, append, arguments, outcomes
+from common import ROOT, SHARED, append, arguments, outcomes
 
 FILE = "portability.jsonl"
 SPACED = os.fsdecode("a folder, spàced".encode())  # under an ASCII locale too
@@ -51,7 +50,7 @@ class Condition:
     environment: dict[str, str] = field(default_factory=dict)
     prefix: tuple[str, ...] = ()
 
-    def __add__(self, other: Condition) -> Condition:
+    def __add__(self, other):
         return Condition(self.environment | other.environment, self.prefix + other.prefix)
 
 
@@ -81,7 +80,7 @@ CONDITIONS = {
 }
 
 
-def run(name: str, tests: Sequence[str]) -> Row:
+def run(name, tests):
     """Counts and seconds of the tests under a condition; ``failures`` names those that failed, or
     says why none ran.
 

@@ -23,7 +23,7 @@ def main():
         run(scene)
 
 
-def run(name: str):
+def run(name):
     torchrun = "-m torch.distributed.run --standalone --nproc-per-node 2 -m clod_adapter"
     runs = {
         "one view": (COMMAND, {"iters": 300, "batch": 1}),

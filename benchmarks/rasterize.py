@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -25,11 +25,9 @@ from typing import Any
 
 import workloads
 from clod_adapter.rasterizers import cpu, reference
-from common import ROOT, Row, Table, append, arguments, last
-from workloads import Size, Workload
+from common import ROOT, Table, append, arguments, last
 
 import torch
-from torch import Tensor
 
 FILE = "rasterize.jsonl"
 YARDSTICK = Path(os.environ.get("CLOD_YARDSTICK", ROOT.parent / "shared" / "yardstick"))
@@ -54,7 +52,7 @@ def main():
         append(FILE, {"kind": kind, **row}, args.record)
 
 
-def page_table() -> Table:
+def page_table():
     """Milliseconds of ours, and in brackets of the yardstick."""
     found = last(FILE, "workload", kind="speed")
     heads, lines = [""], {"forward": ["forward"], "both": ["forward + backward"]}
@@ -66,7 +64,7 @@ def page_table() -> Table:
     return Table(heads, lines.values(), found.values())
 
 
-def speed() -> list[Row]:
+def speed():
     """All times of each workload."""
     with tempfile.TemporaryDirectory() as folder:
         library, rows = build_yardstick(YARDSTICK, Path(folder)), []
@@ -99,7 +97,7 @@ def speed() -> list[Row]:
     return rows
 
 
-def worker(make: Callable[..., Jobs], *given: Any) -> ProcessPoolExecutor:
+def worker(make, *given):
     """A process of its own: the yardstick's library, for example, makes its process flush denormal
     numbers.
     """
@@ -107,21 +105,21 @@ def worker(make: Callable[..., Jobs], *given: Any) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(1, mp_context=spawn, initializer=_start, initargs=(make, *given))
 
 
-def _start(make: Callable[..., Jobs], *given: Any):
+def _start(make, *given):
     torch.set_num_threads(THREADS)
     JOBS.update(make(*given))
 
 
-def _run(job: str) -> Any:
+def _run(job):
     return JOBS[job]()
 
 
-def middle(times: Sequence[float]) -> float | None:
+def middle(times):
     """The median without the first repeats."""
     return round(median(times[WARM:]), 2) if times[WARM:] else None
 
 
-def our_jobs(size: Size) -> Jobs:
+def our_jobs(size):
     """A step; and frames of the most opaque, with opacities 0 of the others, as the dial does."""
     workload = workloads.make(size)
     draw, leaves = ours(workload)
@@ -135,14 +133,14 @@ def our_jobs(size: Size) -> Jobs:
     }
 
 
-def ours(workload: Workload) -> tuple[Callable[[], Tensor], list[Tensor]]:
+def ours(workload):
     """A function that draws the workload with our rasterizer, and the leaves of its gradients."""
     leaves = {name: value.clone().requires_grad_() for name, value in workload.parameters().items()}
     draw = partial(cpu.rasterize, **leaves, camera=workload.camera, background=torch.zeros(3))
     return lambda: draw()[0], list(leaves.values())
 
 
-def timed_step(draw: Callable[[], Tensor], leaves: list[Tensor], weights: Tensor) -> list[float]:
+def timed_step(draw, leaves, weights):
     """Milliseconds of the forward part and of a whole step: all gradients of a weighted sum of the
     pixels.
     """
@@ -156,13 +154,13 @@ def timed_step(draw: Callable[[], Tensor], leaves: list[Tensor], weights: Tensor
 
 
 @torch.no_grad()
-def timed_frame(draw: Callable[[], Tensor]) -> float:
+def timed_frame(draw):
     began = time.perf_counter()
     draw()
     return (time.perf_counter() - began) * 1e3
 
 
-def yardstick_jobs(size: Size, library: Path) -> Jobs:
+def yardstick_jobs(size, library):
     binding = load_module(YARDSTICK / "binding.py")
     kernel = binding.Lib(str(library), THREADS)
     workload = workloads.make(size)
@@ -173,13 +171,13 @@ def yardstick_jobs(size: Size, library: Path) -> Jobs:
     pose = {"viewmat": camera.viewmat, "K": camera.K}
     scene = {**leaves, **pose, "W": camera.width, "H": camera.height}
 
-    def draw() -> Tensor:
+    def draw():
         return binding.render(kernel, scene)[0]
 
     return {"step": lambda: timed_step(draw, list(leaves.values()), workload.weights)}
 
 
-def build_yardstick(source: Path, folder: Path) -> Path | None:
+def build_yardstick(source, folder):
     """The yardstick's library, built as its ``measure.py`` does; None where its source or g++ is
     absent.
 
@@ -202,7 +200,7 @@ def build_yardstick(source: Path, folder: Path) -> Path | None:
     return library
 
 
-def load_module(path: Path) -> Any:
+def load_module(path):
     """A module from a file that is not on the path."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec and spec.loader
@@ -211,7 +209,7 @@ def load_module(path: Path) -> Any:
     return module
 
 
-def accuracy() -> list[Row]:
+def accuracy():
     """Image and gradients of a small room against ``rasterizers/reference.py`` in float64; and one
     thread against two.
 
@@ -243,9 +241,7 @@ def accuracy() -> list[Row]:
     ]
 
 
-def differentiate(
-    scene: Workload, draw: Callable[..., Any], dtype: torch.dtype
-) -> tuple[Tensor, dict[str, Tensor]]:
+def differentiate(scene, draw, dtype):
     """The image, and the gradients of its weighted sum."""
     leaves = {name: value.to(dtype).requires_grad_() for name, value in scene.parameters().items()}
     image = draw(**leaves, camera=scene.camera, background=torch.zeros(3, dtype=dtype))[0]

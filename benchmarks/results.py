@@ -20,7 +20,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -36,7 +36,7 @@ import scaling
 import stability
 import stream
 import walk
-from common import ROOT, SHARED, Row, Table, about, arguments, last
+from common import ROOT, SHARED, Table, about, arguments, last
 
 PAGES = [ROOT / "docs" / f"{name}.md" for name in ("performance", "method", "formats")]
 MARKED = re.compile(r"^( *)<!-- table: (\S+) -->\n(.*?)^ *<!-- end of table -->", re.M | re.S)
@@ -75,7 +75,7 @@ class Task:
     by: Sequence[str] = ()
     where: dict[str, list[str]] = field(default_factory=dict)
 
-    def rows(self) -> list[Row]:
+    def rows(self):
         found = list(last(self.file, *self.by).values()) if self.file else []
         for name, values in self.where.items():
             found = [row for row in found if row[name] in values]
@@ -83,7 +83,7 @@ class Task:
             found += TABLES[name]().rows
         return found
 
-    def state(self) -> str:
+    def state(self):
         found = origins(self.rows())
         if len(found) > 1:
             return f"rows of several commits: run {self.name}"
@@ -91,13 +91,13 @@ class Task:
             return "done"
         return f"rows of {found[0]}" if found else "no rows"
 
-    def absent(self) -> list[str]:
+    def absent(self):
         paths = {need: ROOT / os.path.expandvars(need) for need in self.needs}
         return [
             need for need, path in paths.items() if not path.exists() and not shutil.which(need)
         ]
 
-    def run(self) -> int:
+    def run(self):
         """The exit code."""
         words = shlex.split(os.path.expandvars(self.command))
         began = time.perf_counter()
@@ -107,23 +107,23 @@ class Task:
         return done.returncode
 
 
-def origin(row: Row) -> str:
+def origin(row):
     machine = row["machine"]
     return f"{row['commit']} on {machine['cpu']}, {machine['threads']} threads"
 
 
-def origins(rows: Iterable[Row]) -> list[str]:
+def origins(rows):
     return sorted(set(map(origin, rows)))
 
 
-def tasks() -> list[Task]:
+def tasks():
     import tomllib  # of Python 3.11, which building the pages does not need
 
     text = (ROOT / "benchmarks" / "tasks.toml").read_text("utf-8")
     return [Task(name=name, **values) for name, values in tomllib.loads(text).items()]
 
 
-def chosen(names: Sequence[str], long: bool) -> list[Task]:
+def chosen(names, long):
     """The tasks of these names, or of names that begin so; else all short or all long ones."""
     if not names:
         return [task for task in tasks() if (task.minutes >= LONG) == long]
@@ -135,7 +135,7 @@ def chosen(names: Sequence[str], long: bool) -> list[Task]:
     return found or sys.exit(f"no task is called {' or '.join(names)}; --list has all")
 
 
-def main() -> int:
+def main():
     parser = arguments(__doc__)
     parser.add_argument("names", nargs="*", metavar="TASK", help="these tasks alone")
     for option in ("--long", "--list", "--pages", "--check"):
@@ -154,7 +154,7 @@ def main() -> int:
     return build_pages(write=True) or failed
 
 
-def list_all() -> int:
+def list_all():
     """Prints every task."""
     print(*map(listed, tasks()), sep="\n")
     for target, long in (("results", False), ("results-long", True)):
@@ -163,13 +163,13 @@ def list_all() -> int:
     return 0
 
 
-def listed(task: Task) -> str:
+def listed(task):
     absent = task.absent()
     needs = f"; cannot run here, needs {', '.join(absent)}" if absent else ""
     return f"{task.name:20} {task.minutes:4} min  {task.state()}{needs}"
 
 
-def run(selected: Sequence[Task]) -> int:
+def run(selected):
     """Runs what is not done; 1 if any failed."""
     ready = []
     for task in selected:
@@ -187,7 +187,7 @@ def run(selected: Sequence[Task]) -> int:
     return failed
 
 
-def build_pages(write: bool) -> int:
+def build_pages(write):
     """Compares the marked tables with their rows, or writes them; 1 if there are problems."""
     problems = []
     for page in PAGES:
@@ -199,7 +199,7 @@ def build_pages(write: bool) -> int:
     return int(bool(problems))
 
 
-def rebuilt(page: str, problems: list[str], write: bool, found: re.Match[str]) -> str:
+def rebuilt(page, problems, write, found):
     """A marked table as its rows give it; as it is if these are of several commits or machines."""
     indent, name, _ = found.groups()
     hint = f'run make results ONLY="{name}"'

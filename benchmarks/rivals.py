@@ -14,7 +14,6 @@ A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl`
 """
 
 import tempfile
-from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -22,7 +21,6 @@ import adapt
 import clod_adapter as clod
 from adapt import SHARES
 from common import (
-    Row,
     Table,
     append,
     arguments,
@@ -82,9 +80,7 @@ def main():
                 )
 
 
-def contest(
-    rival: str, base: clod.Checkpoint, folder: Path, views: clod.Scene, iters: int
-) -> Iterator[tuple[str, Mapping[float, clod.Gaussians], Row]]:
+def contest(rival, base, folder, views, iters):
     """For each row: label, file by share, and what else is recorded."""
     gaussians = base.gaussians
     train = views.train
@@ -119,13 +115,11 @@ def contest(
         yield "untouched, by removal error", prefixes(ranked, counts), {}
 
 
-def prefixes(gaussians: clod.Gaussians, counts: Mapping[float, int]) -> dict[float, clod.Gaussians]:
+def prefixes(gaussians, counts):
     return {share: gaussians[:count] for share, count in counts.items()}
 
 
-def kept(
-    base: clod.Checkpoint, folder: Path, counts: Mapping[float, int]
-) -> dict[float, clod.Gaussians]:
+def kept(base, folder, counts):
     """By share, the plain file that ``export --keep`` writes after the default command."""
     with tempfile.TemporaryDirectory() as place:
         dial, plain = Path(place) / "dial.ply", Path(place) / "plain.ply"
@@ -138,7 +132,7 @@ def kept(
     return files
 
 
-def page_table(scene: str) -> Table:
+def page_table(scene):
     """PSNR at the shares; the best of each but the whole is bold."""
     (ours,) = last(adapt.FILE, "scene", scene=scene, label=f"max_sv {MAX_SV}").values()
     found = {label: {} for label in ("ours, one file", *SHOWN.values())}

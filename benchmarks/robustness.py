@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from common import RESULTS, Row, Table, about, arguments, capture, clod_adapt, psnr_kept
+from common import RESULTS, Table, about, arguments, capture, clod_adapt, psnr_kept
 
 SCENE, FILE = "plush_half", RESULTS / "robustness.json"
 CHECKPOINTS = ("pretrained", "pretrained_mask")
@@ -33,11 +33,11 @@ def main():
     FILE.write_text(json.dumps(row), encoding="utf-8")
 
 
-def row() -> Row:
+def row():
     return json.loads(FILE.read_text("utf-8"))
 
 
-def page_table() -> Table:
+def page_table():
     """The dial by the range that was trained; beyond it in italics."""
     stored = row()
     lines = [[f"s = {s}"] for s in RANGES]

@@ -15,7 +15,7 @@ import signal
 import sys
 import tempfile
 import urllib.request
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from itertools import product
 from pathlib import Path
@@ -75,7 +75,7 @@ def main():
         append(FILE, {"series": "count", **about, **cost})
 
 
-def town(count: int) -> Path:
+def town(count):
     """A town, made where it is not there, in a process of its own, so that its memory is given
     back.
     """
@@ -86,11 +86,11 @@ def town(count: int) -> Path:
     return folder
 
 
-def dial_of(folder: Path) -> Path:
+def dial_of(folder):
     return folder.with_name(f"{folder.name}-dial.ply")
 
 
-def run_adapt(folder: Path) -> Row:
+def run_adapt(folder):
     """A few steps."""
     out = dial_of(folder)
     settings = ("--iters", STEPS, "--max-sv", MAX_SV)
@@ -99,17 +99,17 @@ def run_adapt(folder: Path) -> Row:
     return {**run.cost(), "step_seconds": seconds["train"] / STEPS, "phases": seconds}
 
 
-def run_export(folder: Path) -> Row:
+def run_export(folder):
     with tempfile.TemporaryDirectory(dir=CITIES) as out:
         plain = Path(out) / "plain.ply"
         return clod_adapt("export", dial_of(folder), "-o", plain, "--sv", 1.5).cost()
 
 
-def run_eval(folder: Path) -> Row:
+def run_eval(folder):
     return clod_adapt("eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV).cost()
 
 
-def run_view(folder: Path) -> Row:
+def run_view(folder):
     """Until a page would have all of the model; no browser."""
     words = (dial_of(folder), "--images", folder, "--no-browser")
     run = clod_adapt("view", *words, until="http://")
@@ -133,13 +133,13 @@ RUNS: dict[str, Callable[[Path], Row]] = {
 }
 
 
-def exponent(points: Sequence[tuple[float, float]]) -> float:
+def exponent(points):
     """Power of x that y follows, by least squares in logarithms; NaN of fewer than two points."""
     usable = [point for point in points if point[1] > 0]
     return float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) > 1 else math.nan
 
 
-def page_table() -> Table:
+def page_table():
     """Seconds by size, with the exponents above start-up, from FROM on."""
     found = last(FILE, "command", "gaussians", series="count")
     sizes = sorted({count for _, count in found})
@@ -160,7 +160,7 @@ def page_table() -> Table:
     return Table(heads, lines, found.values())
 
 
-def memory_table() -> Table:
+def memory_table():
     """Peak memory at the largest size, and bytes a Gaussian from the one before."""
     found, lines = last(FILE, "command", "gaussians", series="count"), []
     less, most = sorted({count for _, count in found})[-2:]

@@ -17,7 +17,7 @@ import stability_popping
 import stability_scenes
 import stability_stiffness
 from clod_adapter.cli.shared.outputs import jsonable
-from common import RESULTS, ROOT, Table, about, arguments, stored
+from common import RESULTS, ROOT, about, arguments, stored
 
 FILE, IMAGES = "stability.jsonl", ROOT / "docs" / "images"
 PARTS = {
@@ -48,7 +48,7 @@ def main():
     stability_stiffness.picture(rows["stiffness"], IMAGES / "stability_stiffness.png")
 
 
-def page_table(part: str) -> Table:
+def page_table(part):
     rows = [row for row in stored(FILE) if row["part"] == part]
     return PARTS[part].page_table(rows)
 

@@ -6,17 +6,15 @@ number may be off by that number.
 """
 
 import math
-from typing import Any
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import LOG_GROWTH_MAX, SIGMA_MAX, attenuate
-from common import Row, Table
+from common import Table
 
 import mpmath
 import numpy as np
 import torch
 from mpmath import mpf
-from torch import Tensor
 
 mpmath.mp.dps = 50
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -36,12 +34,12 @@ BOUNDS = {
 class Tally:
     """Errors of the quantities in one dtype."""
 
-    def __init__(self, dtype: str):
+    def __init__(self, dtype):
         self.dtype = dtype
         self.info = torch.finfo(DTYPES[dtype])
         self.rows = {}
 
-    def add(self, name: str, got: float, want: Any, allowed: float, scale: Any = None):
+    def add(self, name, got, want, allowed, scale=None):
         """Counts the error of a number, relative to it or to ``scale``."""
         row = self.rows.setdefault(
             name,
@@ -69,7 +67,7 @@ class Tally:
         row["worst_of_bound"] = max(row["worst_of_bound"], error / allowed)
 
 
-def measure() -> list[Row]:
+def measure():
     rows = []
     for dtype in DTYPES:
         tally = Tally(dtype)
@@ -80,16 +78,16 @@ def measure() -> list[Row]:
     return rows
 
 
-def rounded(dtype: str, values: Any) -> Tensor:
+def rounded(dtype, values):
     return torch.tensor(values).to(DTYPES[dtype])
 
 
-def some_of(random: np.random.Generator, *columns: Any) -> Any:
+def some_of(random, *columns):
     """Each number from one of the columns."""
     return np.choose(random.integers(len(columns), size=POINTS), columns)
 
 
-def check_opacities(tally: Tally, random: np.random.Generator, s: float):
+def check_opacities(tally, random, s):
     """Drawn opacities and gradients, from far inside the reach to just beyond it; what is culled
     must be 0.
     """
@@ -117,7 +115,7 @@ def check_opacities(tally: Tally, random: np.random.Generator, s: float):
         tally.add("its gradient by sigma_d", by_sigma, slope, 6)
 
 
-def check_growth(tally: Tally, random: np.random.Generator, s: float):
+def check_growth(tally, random, s):
     exponents = some_of(random, random.uniform(-1, 3, POINTS), random.uniform(-20, 20, POINTS))
     h = rounded(tally.dtype, exponents)
     d = rounded(tally.dtype, 10.0 ** random.uniform(-2, 4, POINTS))
@@ -138,7 +136,7 @@ def check_growth(tally: Tally, random: np.random.Generator, s: float):
             tally.add("its gradient by growth_d", steep, want * log_m * inside, allowed)
 
 
-def page_table(rows: list[Row]) -> Table:
+def page_table(rows):
     """Worst errors and shares of the bounds."""
     lines = {name: [name, bound] for name, bound in BOUNDS.items()}
     for row in rows:

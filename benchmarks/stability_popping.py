@@ -18,12 +18,11 @@ from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.paper import TAU
-from clod_adapter.evaluation.popping import Popping, dial_popping, path_popping
+from clod_adapter.evaluation.popping import dial_popping, path_popping
 from clod_adapter.gaussians import SH_C0, Gaussians
-from common import Row, Table
+from common import Table
 
 import torch
-from torch import Tensor
 
 STEPS = (20, 40, 80, 160)
 SWEEPS = {
@@ -46,7 +45,7 @@ SHOWN = {  # in the table
 DISTANCE = 4.0  # of the camera from the middle
 
 
-def measure() -> list[Row]:
+def measure():
     rows = []
     for form, growth in (*product(FORMS, [0.0]), ("ours", GROWTH)):
         gaussians, cameras = scene(form)
@@ -59,7 +58,7 @@ def measure() -> list[Row]:
     return rows
 
 
-def scene(form: str, others: int = OTHERS) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
+def scene(form, others=OTHERS):
     """The Gaussians, and by name of the sweep the cameras it goes through."""
     draw = torch.Generator().manual_seed(0)
     n = others + TOGETHER + 3
@@ -102,15 +101,13 @@ def scene(form: str, others: int = OTHERS) -> tuple[Gaussians, dict[str, list[cl
     return clod.with_dial(plain, sigma, settings), cameras
 
 
-def _looking(eye: Tensor, at: Tensor) -> clod.Camera:
+def _looking(eye, at):
     camera = look_at(eye.double().numpy(), at.double().numpy(), WIDTH, HEIGHT, "")
     K = intrinsics(1.1 * WIDTH, 1.1 * WIDTH, WIDTH / 2, HEIGHT / 2)
     return replace(camera, K=K)
 
 
-def swept(
-    gaussians: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int
-) -> Popping:
+def swept(gaussians, cameras, sweep, steps):
     """The popping of a sweep, in so many steps."""
     if sweep in ("turn", "path"):
         return path_popping(gaussians, cameras[sweep], SCALE, steps=steps)
@@ -121,7 +118,7 @@ def swept(
     return dial_popping(gaussians, cameras["dial"][0], gaussians.attenuation.max_sv, steps=steps)
 
 
-def page_table(rows: list[Row]) -> Table:
+def page_table(rows):
     """Largest change of a pixel in the longest and the shortest steps."""
     lines = {label: [label] for label in SHOWN.values()}
     ends = (min(STEPS), max(STEPS))

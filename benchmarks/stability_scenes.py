@@ -19,13 +19,12 @@ from typing import Any
 import clod_adapter as clod
 from clod_adapter.cameras import Scene, View, in_its_unit
 from clod_adapter.training.pseudo_views import add_pseudo_views
-from common import Row, Table, capture, checkpoint, photographs, quality
+from common import Table, capture, checkpoint, photographs, quality
 
 import numpy as np
 import pycolmap
 import torch
 from plyfile import PlyData, PlyElement
-from torch import Tensor
 
 CAPTURE = "ci_banana"
 STEPS = 200
@@ -44,10 +43,10 @@ class Case:
 Change = Callable[[clod.Gaussians, Scene], Case]
 
 
-def similar(base: clod.Gaussians, scene: Scene, scale: float) -> Case:
+def similar(base, scene, scale):
     """The same scene in other units."""
 
-    def resized(view: View) -> View:
+    def resized(view):
         camera = view.camera
         return view.at(posed(camera, camera.viewmat[:3, :3], camera.position * scale))
 
@@ -55,13 +54,13 @@ def similar(base: clod.Gaussians, scene: Scene, scale: float) -> Case:
     return Case(larger, in_its_unit(of_views(scene, resized)))
 
 
-def one_view(base: clod.Gaussians, scene: Scene, scale: float) -> Case:
+def one_view(base, scene, scale):
     """A single training image, in other units: one camera does not define the size of a scene."""
     case = similar(base, scene, scale)
     return dataclasses.replace(case, scene=Scene(case.scene.train[:1], case.scene.test))
 
 
-def floater(base: clod.Gaussians, scene: Scene) -> Case:
+def floater(base, scene):
     changed = copy_of(base)
     camera = scene.train[0].camera
     changed.means[0] = camera.position + 1e6 * size_of(base) * camera.viewmat[2, :3]
@@ -69,10 +68,10 @@ def floater(base: clod.Gaussians, scene: Scene) -> Case:
     return Case(changed, scene)
 
 
-def behind(base: clod.Gaussians, scene: Scene) -> Case:
+def behind(base, scene):
     """A third of the training cameras look away from the scene; their photographs are black."""
 
-    def away(view: View) -> View:
+    def away(view):
         camera = view.camera
         back = torch.diag(torch.tensor([-1.0, 1, -1]))
         eye = camera.position - 100 * size_of(base) * camera.viewmat[2, :3]
@@ -83,7 +82,7 @@ def behind(base: clod.Gaussians, scene: Scene) -> Case:
     return Case(base, dataclasses.replace(scene, train=train))
 
 
-def inside(base: clod.Gaussians, scene: Scene) -> Case:
+def inside(base, scene):
     """A Gaussian around a training camera, one around a held-out one, and one with its centre in
     the lens.
     """
@@ -95,12 +94,12 @@ def inside(base: clod.Gaussians, scene: Scene) -> Case:
     return Case(changed, scene)
 
 
-def opacity(base: clod.Gaussians, scene: Scene, value: float) -> Case:
+def opacity(base, scene, value):
     logits = torch.full_like(base.opacity_logits, math.log(value / (1 - value)))
     return Case(base.replace(opacity_logits=logits), scene)
 
 
-def flat(base: clod.Gaussians, scene: Scene, axes: int) -> Case:
+def flat(base, scene, axes):
     """The smallest ``axes`` axes a millionth of the largest: 1 for discs, 2 for needles."""
     order = base.log_scales.argsort(1)[:, :axes]
     shrunk = base.log_scales.amax(1, keepdim=True) - math.log(1e6)
@@ -108,11 +107,11 @@ def flat(base: clod.Gaussians, scene: Scene, axes: int) -> Case:
     return Case(base.replace(log_scales=log_scales), scene)
 
 
-def black(base: clod.Gaussians, scene: Scene) -> Case:
+def black(base, scene):
     return Case(base, of_views(scene, lambda view: View(view.camera, torch.zeros_like(view.image))))
 
 
-def georeferenced(base: clod.Gaussians, scene: Scene, kind: str) -> Case:
+def georeferenced(base, scene, kind):
     """Coordinates a million units off, as file of ``kind`` f4 or f8 and COLMAP model; read back by
     our readers.
     """
@@ -135,20 +134,20 @@ def georeferenced(base: clod.Gaussians, scene: Scene, kind: str) -> Case:
         return Case(checkpoint.gaussians, clod.load_scene(folder, origin=checkpoint.origin))
 
 
-def one_place(base: clod.Gaussians, scene: Scene) -> Case:
+def one_place(base, scene):
     return Case(base.replace(means=base.means.median(0).values.repeat(len(base), 1)), scene)
 
 
-def twice(base: clod.Gaussians, scene: Scene) -> Case:
+def twice(base, scene):
     return Case(base, Scene((*scene.train, scene.train[0]), scene.test))
 
 
-def copy_of(base: clod.Gaussians) -> clod.Gaussians:
+def copy_of(base):
     """A copy whose rows can be changed."""
     return base.replace(**{name: value.clone() for name, value in base.tensors().items()})
 
 
-def posed(camera: clod.Camera, rotation: Tensor, eye: Tensor) -> clod.Camera:
+def posed(camera, rotation, eye):
     """The camera at another place, turned another way."""
     viewmat = camera.viewmat.clone()
     viewmat[:3, :3] = rotation
@@ -156,11 +155,11 @@ def posed(camera: clod.Camera, rotation: Tensor, eye: Tensor) -> clod.Camera:
     return dataclasses.replace(camera, viewmat=viewmat)
 
 
-def of_views(scene: Scene, change: Callable[[View], View]) -> Scene:
+def of_views(scene, change):
     return Scene(tuple(map(change, scene.train)), tuple(map(change, scene.test)))
 
 
-def size_of(base: clod.Gaussians) -> float:
+def size_of(base):
     """Size of the bulk of the scene, in world units."""
     low, high = (base.means.quantile(q, 0) for q in (0.1, 0.9))
     return float((high - low).norm())
@@ -201,12 +200,12 @@ TOGETHER = {  # in the table
 }
 
 
-def measure() -> list[Row]:
+def measure():
     base, scene = checkpoint(CAPTURE).gaussians, photographs(CAPTURE)
     return [run(name, make(base, scene)) for name, make in CASES.items()]
 
 
-def run(name: str, case: Case) -> Row:
+def run(name, case):
     config = clod.AdaptConfig(**{"iters": STEPS, **case.settings})
     started = time.perf_counter()
     adapted = clod.adapt(case.base, add_pseudo_views(case.base, case.scene), config)
@@ -228,7 +227,7 @@ def run(name: str, case: Case) -> Row:
     }
 
 
-def page_table(rows: list[Row]) -> Table:
+def page_table(rows):
     """PSNR @ share kept at both ends of the dial, and which cases hold; of cases with one label
     the worst.
     """

@@ -10,11 +10,9 @@ same gradients, and RowAdam's epsilon, which is that of 3DGS.
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
-from typing import Any
 
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
@@ -34,7 +32,7 @@ from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.schedule import OURS
 from clod_adapter.training.target_count import count_gradient, target_share
-from common import Row, Table
+from common import Table
 
 import numpy as np
 import torch
@@ -50,13 +48,11 @@ CONVERGED = 0.25  # of the start's error
 Stepper = Callable[[list[Tensor], list[float]], None]
 
 
-def _torch_optimizer(
-    kind: type[torch.optim.Optimizer], **settings: Any
-) -> Callable[[list[Tensor]], Stepper]:
-    def make(runs: list[Tensor]) -> Stepper:
+def _torch_optimizer(kind, **settings):
+    def make(runs):
         optimizer = kind([{"params": [x]} for x in runs], lr=1.0, **settings)
 
-        def step(gradients: list[Tensor], rates: list[float]):
+        def step(gradients, rates):
             for group, gradient, rate in zip(optimizer.param_groups, gradients, rates, strict=True):
                 group["params"][0].grad, group["lr"] = gradient, rate
             optimizer.step()
@@ -66,8 +62,8 @@ def _torch_optimizer(
     return make
 
 
-def _row_adam(runs: list[Tensor]) -> Stepper:
-    def named(values: Iterable[Any]) -> dict[str, Any]:
+def _row_adam(runs):
+    def named(values):
         return {str(run): value for run, value in enumerate(values)}
 
     rows = torch.ones(len(runs[0]), dtype=torch.bool)
@@ -100,12 +96,12 @@ class Problem:
     start: Tensor
     wanted: Tensor
 
-    def parameter(self, log: bool) -> Tensor:
+    def parameter(self, log):
         """What training starts with: sigma_d, or its logarithm."""
         sigma = self.start.clamp(*SIGMA_RANGE)
         return sigma.log() if log else sigma
 
-    def error(self, sigma: Tensor) -> float:
+    def error(self, sigma):
         """Root mean square over Gaussians and dial values of the opacity they are drawn with, less
         the right one.
         """
@@ -113,12 +109,12 @@ class Problem:
         return float((opacities - self.wanted).square().mean().sqrt())
 
 
-def drawn(logits: Tensor, sigma: Tensor, distances: Tensor) -> Tensor:
+def drawn(logits, sigma, distances):
     settings = CONFIG.attenuation(1.0)
     return torch.stack([attenuate(logits, sigma, distances, s, settings).drawn for s in DIALS])
 
 
-def problem(n: int = 192) -> Problem:
+def problem(n=192):
     """Distances d' from 1e-3 to 1e5, log-uniform; the start is wrong by up to WRONG decades each
     way.
     """
@@ -132,9 +128,7 @@ def problem(n: int = 192) -> Problem:
 
 
 @torch_on_one_thread()
-def fit(
-    task: Problem, optimizer: str, log: bool, rates: Sequence[float], steps: int
-) -> tuple[list[Tensor], float]:
+def fit(task, optimizer, log, rates, steps):
     """sigma_d after training, at dial value 1 and another one a step; and seconds. One run a rate,
     all at once.
     """
@@ -159,7 +153,7 @@ def fit(
     return list(means.exp() if log else means), time.perf_counter() - began
 
 
-def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int]) -> Tensor:
+def gradients(task, x, log, dials):
     """``[runs, N]``: gradient by ``x`` of the loss at these dial values and of the count term."""
     settings = CONFIG.attenuation(1.0)
     n = len(task.start)
@@ -182,7 +176,7 @@ def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int]) -> Tens
     return gradient + (pull if log else pull / x.detach())
 
 
-def measure() -> list[Row]:
+def measure():
     task, rows = problem(), []
     for optimizer, log in product(OPTIMIZERS, (True, False)):
         parameter = "log" if log else "linear"
@@ -201,7 +195,7 @@ def measure() -> list[Row]:
     return rows
 
 
-def curves(rows: list[Row], timed: bool) -> dict[tuple[str, str], list[Row]]:
+def curves(rows, timed):
     """Rows by optimizer and parameter: over the learning rates; or, timed, over the steps at the
     best one.
     """
@@ -212,7 +206,7 @@ def curves(rows: list[Row], timed: bool) -> dict[tuple[str, str], list[Row]]:
     return lines
 
 
-def page_table(rows: list[Row]) -> Table:
+def page_table(rows):
     """Error and learning rates that converge of the logarithm; optimizers that are alike share a
     line.
     """
@@ -231,7 +225,7 @@ def page_table(rows: list[Row]) -> Table:
     return Table(heads, lines, rows)
 
 
-def picture(rows: list[Row], path: Path):
+def picture(rows, path):
     """Error by learning rate on the left, by seconds at the best one on the right; dots for linear
     sigma_d.
     """

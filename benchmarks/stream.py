@@ -18,14 +18,13 @@ held-out photographs.
 import json
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import clod_adapter as clod
 from clod_adapter.losses import decibels
-from common import Row, Table, append, arguments, clod_adapt, last, percent, with_best
+from common import Table, append, arguments, clod_adapt, last, percent, with_best
 from tuning import TIMEOUT, find_tool
 
 import numpy as np
@@ -72,7 +71,7 @@ def main():
             append(FILE, {"scene": scene, **row}, args.record)
 
 
-def of_dial(base: clod.Gaussians, adapted: Path, views: Sequence[clod.View]) -> Iterator[Row]:
+def of_dial(base, adapted, views):
     """The dial at 1, 2 and 5, and at each budget."""
     dial = clod.load(adapted).gaussians
     for s in (0.0, 1.0, 2.0, 5.0):
@@ -83,7 +82,7 @@ def of_dial(base: clod.Gaussians, adapted: Path, views: Sequence[clod.View]) -> 
         yield {"method": "dial", **measured(Dial(dial), views, budget, len(base))}
 
 
-def sets_of(scene: Path, adapted: Path, folder: Path) -> dict[str, Files]:
+def sets_of(scene, adapted, folder):
     """The levels of each set for each multiplier, the finest first."""
     sets = {}
     for name, option in SETS.items():
@@ -94,9 +93,7 @@ def sets_of(scene: Path, adapted: Path, folder: Path) -> dict[str, Files]:
     return sets
 
 
-def of_sets(
-    base: clod.Gaussians, sets: dict[str, Files], views: Sequence[clod.View]
-) -> Iterator[Row]:
+def of_sets(base, sets, views):
     """Each set at each budget, with the multiplier that is best there."""
     frames = Frames(base)
     for name, files in sets.items():
@@ -111,14 +108,14 @@ def of_sets(
         yield from found.values()
 
 
-def rendered(base: clod.Gaussians) -> list[clod.View]:
+def rendered(base):
     """The checkpoint's own renders from VIEWS placed cameras that training does not use."""
     cameras = clod.place_cameras(base, views=VIEWS, seed=SEED)
     with torch.no_grad():
         return [clod.View(camera, clod.render(base, camera).pixels) for camera in cameras]
 
 
-def measured(shown: "Dial | Levels", views: Sequence[clod.View], budget: float, whole: int) -> Row:
+def measured(shown, views, budget, whole):
     """PSNR over the views, and the mean share drawn."""
     errors, counts = [], []
     for view in views:
@@ -135,7 +132,7 @@ def measured(shown: "Dial | Levels", views: Sequence[clod.View], budget: float, 
 class Dial:
     gaussians: clod.Gaussians
 
-    def frame(self, camera: clod.Camera, count: int) -> tuple[clod.Gaussians, float, int]:
+    def frame(self, camera, count):
         """What is drawn of about ``count`` Gaussians, the dial value, and their exact number."""
         s = clod.dial_for(self.gaussians, keep=count, cameras=[camera]).virtual_scale
         return (
@@ -157,7 +154,7 @@ class Cut(NamedTuple):
 class Frames:
     """The nodes of a scene: a k-d tree of the checkpoint's centres, the same for every set."""
 
-    def __init__(self, base: clod.Gaussians):
+    def __init__(self, base):
         self.means, self.leaves = base.means.numpy(), []
         self.tree = self._cut(np.arange(len(base)))
         boxes = [self.means[rows] for rows in self.leaves]
@@ -166,7 +163,7 @@ class Frames:
             np.stack([box.max(0) for box in boxes]),
         )
 
-    def _cut(self, rows: np.ndarray) -> Cut | int:
+    def _cut(self, rows):
         points = self.means[rows]
         axis = int(np.argmax(np.ptp(points, axis=0)))
         at = float(np.median(points[:, axis]))
@@ -176,7 +173,7 @@ class Frames:
             return len(self.leaves) - 1
         return Cut(axis, at, self._cut(rows[low]), self._cut(rows[~low]))
 
-    def nodes(self, means: np.ndarray) -> np.ndarray:
+    def nodes(self, means):
         """``[N]`` the leaf of each centre."""
         found, todo = np.empty(len(means), np.int64), [(self.tree, np.arange(len(means)))]
         while todo:
@@ -188,7 +185,7 @@ class Frames:
                 found[rows] = node
         return found
 
-    def distances(self, camera: clod.Camera) -> np.ndarray:
+    def distances(self, camera):
         eye = camera.position.double().numpy()
         return np.linalg.norm(np.clip(eye, self.low, self.high) - eye, axis=1)
 
@@ -196,18 +193,18 @@ class Frames:
 class Levels:
     """A set of levels, the finest first."""
 
-    def __init__(self, levels: list[clod.Gaussians], multiplier: float, frames: Frames):
+    def __init__(self, levels, multiplier, frames):
         self.levels, self.step, self.frames = levels, math.log(multiplier), frames
         self.nodes = [frames.nodes(level.means.numpy()) for level in levels]
         self.counts = np.stack(
             [np.bincount(nodes, minlength=len(frames.leaves)) for nodes in self.nodes]
         )
 
-    def frame(self, camera: clod.Camera, count: int) -> tuple[clod.Gaussians, float, int]:
+    def frame(self, camera, count):
         """As ``Dial.frame``."""
         distances, every = self.frames.distances(camera), np.arange(len(self.frames.leaves))
 
-        def chosen(K: float) -> np.ndarray:
+        def chosen(K):
             bands = np.floor(np.log(np.maximum(distances, 1e-9) / K) / self.step).astype(int) + 1
             return np.clip(bands, 0, len(self.levels) - 1)
 
@@ -224,7 +221,7 @@ class Levels:
         return parts[0].replace(**joined), 1.0, int(self.counts[level, every].sum())
 
 
-def halved(scene: Path, option: str, folder: Path) -> list[Path]:
+def halved(scene, option, folder):
     """SCENE halved HALVED times, the finest first."""
     folder.mkdir()
     files, count = [scene], len(clod.load(scene).gaussians)
@@ -234,7 +231,7 @@ def halved(scene: Path, option: str, folder: Path) -> list[Path]:
     return files[1:]
 
 
-def own_levels(adapted: Path, multiplier: float, folder: Path) -> list[Path]:
+def own_levels(adapted, multiplier, folder):
     """The levels of ``export --lod-meta``, as splat-transform reads them."""
     clod_adapt("export", adapted, "--lod-meta", "--multiplier", multiplier, "--out", folder)
     meta, files = folder / "lod-meta.json", []
@@ -244,7 +241,7 @@ def own_levels(adapted: Path, multiplier: float, folder: Path) -> list[Path]:
     return files
 
 
-def page_table(scene: str) -> Table:
+def page_table(scene):
     """The methods at each budget; the best is bold."""
     found = last(FILE, "method", "level", scene=scene)
     rows = []

@@ -12,7 +12,6 @@ tuned with random prefixes, of which the same counts are measured. Each run adds
 """
 
 import time
-from collections.abc import Callable
 from functools import partial
 from itertools import product
 
@@ -52,18 +51,18 @@ Runs = tuple[list[float], list[Row]]  # seconds to the file of each dial value, 
 
 
 def dial(
-    config_of: Callable[..., clod.AdaptConfig],
-    scene: str,
-    base: clod.Checkpoint,
-    views: clod.Scene,
-    iters: int,
-) -> Runs:
+    config_of,
+    scene,
+    base,
+    views,
+    iters,
+):
     adapted = clod.adapt(base.gaussians, views, config_of(max_sv=MAX_SV, iters=iters))
     seconds = adapted.start_seconds + adapted.seconds
     return [seconds] * len(DIALS), quality(adapted.gaussians, views.test, DIALS)
 
 
-def specialists(scene: str, base: clod.Checkpoint, views: clod.Scene, iters: int) -> Runs:
+def specialists(scene, base, views, iters):
     """Merging is within the time."""
     seconds, rows = [], []
     for s, count in zip(DIALS, counts(scene), strict=True):
@@ -74,7 +73,7 @@ def specialists(scene: str, base: clod.Checkpoint, views: clod.Scene, iters: int
     return seconds, rows
 
 
-def prefixes(scene: str, base: clod.Checkpoint, views: clod.Scene, iters: int) -> Runs:
+def prefixes(scene, base, views, iters):
     """Ordering is within the time."""
     began = time.perf_counter()
     start = by_importance(base.gaussians, views.train)
@@ -95,18 +94,18 @@ METHODS = {
 }
 
 
-def row_of(file: clod.Gaussians, views: clod.Scene, s: float, count: int) -> Row:
+def row_of(file, views, s, count):
     (row,) = quality(file, views.test, 1.0)
     return row | {"virtual_scale": s, "kept_share": len(file) / count}
 
 
-def counts(scene: str) -> list[int]:
+def counts(scene):
     """Gaussians that ours keeps at each dial value in its longest run, of equal ones the last."""
     runs = last(FILE, "iters", scene=scene, method="ours")
     return [round(row["kept"]) for row in runs[max(runs)]["rows"]]
 
 
-def curves(scene: str, k: int) -> list[Row]:
+def curves(scene, k):
     """Lines by method at the k-th dial value, by rising time; of equal runs the last."""
     runs = last(FILE, "method", "iters", scene=scene)
     points = {method: [] for method in LABELS}
@@ -122,7 +121,7 @@ def curves(scene: str, k: int) -> list[Row]:
     ]
 
 
-def plot(scene: str):
+def plot(scene):
     """A panel a dial value: error against seconds of training."""
     base = stored(FILE)[-1]["base"]
     with new_figure((4.6 * len(DIALS), 4.3), layout="constrained") as figure:

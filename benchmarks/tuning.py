@@ -22,7 +22,6 @@ from common import CACHE, ROOT
 
 import numpy as np
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 TIMEOUT = 3600.0  # seconds of a merging
@@ -48,9 +47,7 @@ class Tuning:
     shortest: float = 0.01
 
 
-def tune(
-    start: clod.Gaussians, views: tuple[clod.View, ...], config: Tuning
-) -> tuple[clod.Gaussians, float]:
+def tune(start, views, config):
     """Minimises 0.8 L1 + 0.2 (1 - SSIM), a view a step, with Adam over all attributes; the result,
     and seconds.
 
@@ -82,12 +79,12 @@ def tune(
 
 @torch_on_one_thread()
 def _gradients(
-    start: clod.Gaussians,
-    parameters: dict[str, Tensor],
-    tuned: list[str],
-    view: clod.View,
-    prefix: int | None,
-) -> dict[str, Tensor]:
+    start,
+    parameters,
+    tuned,
+    view,
+    prefix,
+):
     leaves = {
         name: value.detach().requires_grad_(name in tuned) for name, value in parameters.items()
     }
@@ -102,12 +99,12 @@ def _gradients(
     return dict(zip(tuned, gradients, strict=True))
 
 
-def by_importance(gaussians: clod.Gaussians, views: tuple[clod.View, ...]) -> clod.Gaussians:
+def by_importance(gaussians, views):
     """The Gaussians by falling removal error, equal ones in their order."""
     return gaussians[removal_error(gaussians, views).argsort(descending=True, stable=True)]
 
 
-def find_tool() -> SplatTransform:
+def find_tool():
     """splat-transform of ``make peers``, or on the PATH, without a GPU; exits where it is missing
     or too old.
     """
@@ -124,9 +121,7 @@ def find_tool() -> SplatTransform:
 MERGINGS = ("--decimate-adaptive", "--decimate")
 
 
-def merge(
-    base: clod.Checkpoint, count: int, method: str = MERGINGS[0]
-) -> tuple[clod.Gaussians, float]:
+def merge(base, count, method=MERGINGS[0]):
     """The base merged to ``count`` Gaussians, and the seconds that the tool took, then or now.
 
     Args:

@@ -6,11 +6,9 @@ held-out cameras and dial values, and with the equation off: PSNR between the br
 """
 
 import sys
-from pathlib import Path
-from typing import Any
 
 import clod_adapter as clod
-from common import CACHE, ROOT, Row, append, arguments, capture, clod_adapt
+from common import CACHE, ROOT, append, arguments, capture, clod_adapt
 
 import numpy as np
 import torch
@@ -33,7 +31,7 @@ def main():
             append(FILE, measure(chromium, name))
 
 
-def measure(chromium: Any, name: str) -> Row:
+def measure(chromium, name):
     """Pictures and counts at held-out cameras."""
     path = adapted(name)
     model = clod.load(path)
@@ -57,7 +55,7 @@ def measure(chromium: Any, name: str) -> Row:
         }
 
 
-def compare(shown: Shown, gaussians: clod.Gaussians, camera: clod.Camera) -> list[Row]:
+def compare(shown, gaussians, camera):
     """A camera at each dial value, and with the equation off (dial None)."""
     shown.camera(camera)
     rows = []
@@ -80,7 +78,7 @@ def compare(shown: Shown, gaussians: clod.Gaussians, camera: clod.Camera) -> lis
     return rows
 
 
-def adapted(name: str) -> Path:
+def adapted(name):
     """The capture's checkpoint with a dial."""
     path = CACHE / f"viewer-{name}.ply"
     if not path.exists():

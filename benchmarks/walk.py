@@ -18,7 +18,7 @@ import clod_adapter as clod
 from city import HOUSE, PITCH, SKY, city, city_cameras, direction, look_at, lots, perturb
 from clod_adapter.config import FILTERS
 from clod_adapter.io.atomic import atomic_path
-from common import CACHE, Row, Table, append, arguments, clod_adapt, stored
+from common import CACHE, Table, append, arguments, clod_adapt, stored
 from models import write_photographs
 from tuning import Tuning, tune
 
@@ -43,7 +43,7 @@ def main():
     append(FILE, measure(COUNT), parser.parse_args().record)
 
 
-def measure(count: int) -> Row:
+def measure(count):
     folder = made(count)
     base = folder / "base.ply"
     truth = town(count)
@@ -66,7 +66,7 @@ def measure(count: int) -> Row:
     return row
 
 
-def town(count: int) -> clod.Gaussians:
+def town(count):
     """The truth, with a sky that is farther away than the walk."""
     truth = city(count).replace(screen_filter=FILTERS["on"])
     sky = slice(count - round(SKY * count), count)
@@ -76,7 +76,7 @@ def town(count: int) -> clod.Gaussians:
     return truth
 
 
-def made(count: int) -> Path:
+def made(count):
     """A folder of photographs with their checkpoint, ``base.ply``, made now if it is not in the
     cache.
     """
@@ -93,7 +93,7 @@ def made(count: int) -> Path:
     return folder
 
 
-def photographers(count: int) -> list[clod.Camera]:
+def photographers(count):
     """A third each in the streets, in the air, and on all sides as far away as the walk."""
     third = PHOTOGRAPHS // 3
     random = np.random.default_rng(2)
@@ -107,7 +107,7 @@ def photographers(count: int) -> list[clod.Camera]:
     return cameras
 
 
-def walker(count: int, distance: float) -> clod.Camera:
+def walker(count, distance):
     """From a door in the middle of the town into its street, then along that and up; always facing
     the door.
     """
@@ -121,7 +121,7 @@ def walker(count: int, distance: float) -> clod.Camera:
     return look_at(eye, door, *SIZE, f"{distance:g} m")
 
 
-def page_table() -> Table:
+def page_table():
     """Means over the frames of each band of distance, of the last row."""
     row = stored(FILE)[-1]
     distances = np.array(row["distances"])
@@ -139,13 +139,13 @@ def page_table() -> Table:
     return Table(heads, lines, [row], 1)
 
 
-def means(frames: list[Row], rows: np.ndarray) -> np.ndarray:
+def means(frames, rows):
     """Mean PSNR and number of Gaussians in view."""
     return np.array([(frame["psnr"], frame["in_view"]) for frame in frames])[rows].mean(0)
 
 
 @torch.no_grad()
-def supersampled(gaussians: clod.Gaussians, camera: clod.Camera) -> torch.Tensor:
+def supersampled(gaussians, camera):
     """``[H, W, 3]`` uint8, a render with SAMPLES by SAMPLES samples in a pixel."""
     larger = camera.resized(SAMPLES * camera.width, SAMPLES * camera.height)
     image = clod.render(gaussians, larger).image

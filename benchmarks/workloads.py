@@ -44,7 +44,7 @@ class Workload:
     camera: Camera
     weights: Tensor
 
-    def parameters(self) -> dict[str, Tensor]:
+    def parameters(self):
         """What a rasterizer takes, by name: views or copies, all contiguous."""
         fields = {name: getattr(self, name) for name in FIELDS[:-1]}
         return {
@@ -54,7 +54,7 @@ class Workload:
         }
 
 
-def make(size: Size) -> Workload:
+def make(size):
     """A workload; the draws come in a fixed order, which the numbers depend on."""
     draw = np.random.default_rng(size.seed)
     count, width, height = size[:3]
@@ -75,11 +75,11 @@ def make(size: Size) -> Workload:
     )
 
 
-def _tensor(array: Array) -> Tensor:
+def _tensor(array):
     return torch.from_numpy(np.ascontiguousarray(array, np.float32))
 
 
-def _pose(width: int) -> tuple[Array, Array, float]:
+def _pose(width):
     """Rotation and translation of the view matrix, and the focal length in pixels."""
     yaw, pitch = np.radians(6.0), np.radians(-4.0)
     about_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
@@ -91,7 +91,7 @@ def _pose(width: int) -> tuple[Array, Array, float]:
     return rotation, translation, 0.5 * width / np.tan(np.radians(60) / 2)
 
 
-def _surface_points(draw: np.random.Generator, count: int) -> Array:
+def _surface_points(draw, count):
     """Points near the surfaces: back, left, right, floor and ceiling of a room, four spheres, two
     boxes.
     """
@@ -116,7 +116,7 @@ def _surface_points(draw: np.random.Generator, count: int) -> Array:
     return points + draw.normal(scale=0.015, size=points.shape)
 
 
-def _sizes_and_opacities(draw: np.random.Generator, count: int) -> tuple[Array, Array]:
+def _sizes_and_opacities(draw, count):
     """Standard deviations in pixels, and opacities: many faint, some nearly opaque; one in twenty
     large and faint.
     """
@@ -135,7 +135,7 @@ def _sizes_and_opacities(draw: np.random.Generator, count: int) -> tuple[Array, 
     return pixels, opacities
 
 
-def _colors(draw: np.random.Generator, points: Array) -> Array:
+def _colors(draw, points):
     """Spherical harmonics of degree 3: waves of colour through the room, higher degrees at
     random.
     """
@@ -148,7 +148,7 @@ def _colors(draw: np.random.Generator, points: Array) -> Array:
     return sh
 
 
-def differences(ours: Workload, theirs: dict[str, Array | int]) -> list[str]:
+def differences(ours, theirs):
     """Names of the yardstick's arrays that are not ours bit for bit."""
     mine = {name: getattr(ours, name) for name in FIELDS} | {"G": ours.weights}
     mine |= {name: getattr(ours.camera, name) for name in ("viewmat", "K", "width", "height")}
