@@ -217,7 +217,7 @@ def test_text_models_of_other_programs(tmp_path):
         folder / "frames.txt",
     ):
         file.unlink()
-    file, header, images = folder / "images.txt", list[str](), list[str]()
+    file, header, images = folder / "images.txt", [], []
     for line in file.read_text().splitlines():
         if line.startswith("#"):
             header.append(line)

@@ -73,7 +73,7 @@ def test_find(tool, monkeypatch, tmp_path):
 
 
 def test_run(tmp_path, tool):
-    out, ticks = tmp_path / "out", list[float]()
+    out, ticks = tmp_path / "out", []
     tool(ANSWERS, "open(words[-1], 'w').write(' '.join(words[:-1]))", "time.sleep(0.5)")
     found = SplatTransform.find()
     seconds = replace(found, gpu=False).run("a.ply", out, timeout=60, progress=ticks.append)
