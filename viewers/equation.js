@@ -1,7 +1,7 @@
 // The dial's equation in float64, as in clod_adapter/equation/attenuation.py. A Gaussian is kept at the dial values of a
 // band: from `begin`, which is 0 for all but far Gaussians, to `end`, where its reach, or near_distance, is d s.
 
-const BEGIN = Math.sqrt(0.8); // far Gaussians begin at this share of near_distance
+const BEGIN = Math.sqrt(11 / 12); // far Gaussians begin at this share of near_distance
 
 /** The dial value from which on a Gaussian is kept at a squared distance, world units^2. */
 export const beginOf = (sigma, squared, { near_distance: near = 0 }) =>

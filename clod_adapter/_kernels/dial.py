@@ -38,7 +38,7 @@ NEAR2, ACTIVATED = 2, 3
 DIAL = 4
 
 LN2 = float32(0.6931471805599453)
-TAKEOVER = 5  # attenuation.TAKEOVER
+TAKEOVER = 12  # attenuation.TAKEOVER
 FARTHEST_EXPONENT = 126  # of exp2
 LOG2_GROWTH_MAX = float32(20 * 1.4426950408889634)  # attenuation.LOG_GROWTH_MAX
 NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
@@ -81,6 +81,13 @@ def survives(sigma, far2, near2):
 def squared_share(sigma, far2):
     """``t^2``, at most 1."""
     return vmin(far2 / squared_reach(sigma, far2), 1)
+
+
+@inlined
+def eighth_power(square):
+    """``t^8`` of ``t^2``."""
+    fourth = square * square
+    return fourth * fourth
 
 
 @inlined
@@ -148,8 +155,7 @@ def drawn(rows, stored, drawing, w):
         distance2 = squared_distance(w, drawing.cam)
         reach = gather(stored.sigma, rows)
         far2 = distance2 * dial[RATE2]
-        share2 = squared_share(reach, far2)
-        fade = 1 - share2 * share2
+        fade = 1 - eighth_power(squared_share(reach, far2))
         if dial[NEAR2] > 0:
             takeover_share = vmin(1, vmax(0, takeover(far2, dial[NEAR2])))
             fade = select(gt(reach, 0), fade * takeover_share, 1 - takeover_share)
@@ -178,7 +184,7 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
     Gaussian::
 
         dL/dlogit    = w sigmoid(-logit)
-        dL/dsigma    = w 4 t^4 / ((1 - t^4) sigma)      distances are constants
+        dL/dsigma    = w 8 t^8 / ((1 - t^8) sigma)      distances are constants
         dL/dlogscale = dL/dscale scale
         dL/dgrowth   = sum of dL/dlogscale, times log m         0 where the growth is clamped
 
@@ -197,10 +203,9 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
     if drawing.fades:
         reach = gather(stored.sigma, rows)
         distance2 = squared_distance(w, drawing.cam)
-        share2 = squared_share(reach, distance2 * dial[RATE2])
-        share4 = share2 * share2
-        fading = both(gt(share4, 0), gt(1, share4))
-        slope = 4 * share4 / ((1 - share4) * reach)
+        share8 = eighth_power(squared_share(reach, distance2 * dial[RATE2]))
+        fading = both(gt(share8, 0), gt(1, share8))
+        slope = 8 * share8 / ((1 - share8) * reach)
         scatter(gradients.sigma, rows, select(fading, total * slope, 0))
         if drawing.grows and shaped:
             magnification = log2_magnification(distance2, dial)

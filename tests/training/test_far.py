@@ -51,9 +51,9 @@ def test_far_ones_take_over_from_near_ones():
     )
     assert torch.allclose(near.drawn + far.drawn, torch.tensor(0.8, dtype=torch.float64), atol=1e-9)
     assert torch.equal(near.keep, d * s < 2)
-    assert torch.equal(far.keep, (d * s / 2).square() * 5 - 4 > 0)
+    assert torch.equal(far.keep, (d * s / 2).square() * 12 - 11 > 0)
     slopes = torch.stack([near.drawn, far.drawn]).diff(dim=1).abs() / d.clamp(min=1e-9).log().diff()
-    assert float(slopes[:, 1:].max()) <= 10 * 0.8 + 1e-6
+    assert float(slopes[:, 1:].max()) <= 24 * 0.8 + 1e-6
 
 
 def test_few_photographs_merge_nothing_away(both):

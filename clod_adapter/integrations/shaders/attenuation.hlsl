@@ -3,10 +3,11 @@
 float clodOpacity(float opacity, float sigma, float seenFrom, float scale, float nearDistance) {
   float reached = seenFrom * scale;
   float x = nearDistance > 0.0 ? min(reached / nearDistance, 1.0) : 1.0;
-  float taken = max(5.0 * x * x - 4.0, 0.0);
+  float taken = max(12.0 * x * x - 11.0, 0.0);
   if (nearDistance > 0.0 && sigma <= 0.0) return opacity * (1.0 - taken);
   float t = reached < sigma ? reached / sigma : 1.0;
-  return reached > 0.0 ? opacity * taken * max(1.0 - t * t * t * t, 0.0) : opacity * taken;
+  float t4 = t * t * t * t;
+  return reached > 0.0 ? opacity * taken * max(1.0 - t4 * t4, 0.0) : opacity * taken;
 }
 
 // The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.
