@@ -38,6 +38,7 @@ class Phase(str, Enum):
     MERGING = "merging"
     PRUNING_ORDER = "pruning order"
     TRAINING = "training"
+    NEAR_DISTANCE = "near distance"
     EVALUATION = "evaluation"
     FRAME_TIMES = "frame times"
     POPPING = "popping"

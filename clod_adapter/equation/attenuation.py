@@ -170,6 +170,22 @@ def takeover_distance(config: AttenuationConfig, share: float) -> float:
     return math.sqrt(1 - (1 - share) / TAKEOVER) * config.near_distance / config.scene_distance
 
 
+def kept_between(
+    gaussians: Gaussians, distances: Tensor, baked: bool = False
+) -> tuple[Tensor, Tensor]:
+    """``[N]`` twice, float64: the dial values between which each is kept at its distance d ``[N]``,
+    the end excluded; in the equation, or with ``baked`` in a plain file.
+    """
+    config = gaussians.attenuation
+    assert gaussians.sigma_d is not None and config is not None
+    d = distances.double()
+    begin, end = torch.zeros_like(d), (gaussians.sigma_d.double() / d).masked_fill(d == 0, math.inf)
+    if (near := gaussians.near) is None:
+        return begin, end
+    first, last = (takeover_distance(config, share) for share in ((0.5, 0.5) if baked else (0, 1)))
+    return torch.where(near, begin, first / d), torch.where(near, last / d, end)
+
+
 def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:
     """``attenuate`` of Gaussians, seen from a camera, or from distances d ``[N]`` where these are
     known.

@@ -23,7 +23,7 @@ from torch import Tensor
 from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, number, require
-from clod_adapter.equation.attenuation import dial, takeover_distance
+from clod_adapter.equation.attenuation import dial, kept_between
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import time_frames
@@ -186,7 +186,7 @@ def _for_count(
         distances = typical_distance(gaussians.means, views[k], config)
         if config.form == "paper":  # whose cut depends on opacity
             return lambda s: dial(gaussians, distances, s).keep
-        begin, end = _kept_between(gaussians, distances, config, baked)
+        begin, end = kept_between(gaussians, distances, baked)
         return lambda s: (begin < s) & (s < end)
 
     def count(virtual_scale: float) -> int:
@@ -216,21 +216,6 @@ def _for_count(
         middle = math.sqrt(low * high)
         low, high = (low, middle) if count(middle) <= wanted else (middle, high)
     return DialValue(high, note)
-
-
-def _kept_between(
-    gaussians: Gaussians, distances: Tensor, config: AttenuationConfig, baked: bool
-) -> tuple[Tensor, Tensor]:
-    """``[N]`` twice, float64: the dial values between which each is kept at its distance ``[N]``,
-    the end excluded; in the equation, or with ``baked`` in a plain file.
-    """
-    assert gaussians.sigma_d is not None
-    d = distances.double()
-    begin, end = torch.zeros_like(d), (gaussians.sigma_d.double() / d).masked_fill(d == 0, math.inf)
-    if (near := gaussians.near) is None:
-        return begin, end
-    first, last = (takeover_distance(config, share) for share in ((0.5, 0.5) if baked else (0, 1)))
-    return torch.where(near, begin, first / d), torch.where(near, last / d, end)
 
 
 @torch.no_grad()

@@ -35,7 +35,7 @@ from clod_adapter.initialization.merging import merge
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.progress import Listener
 from clod_adapter.rasterizers import ALPHA_MAX
-from clod_adapter.training.pseudo_views import PseudoView
+from clod_adapter.training.pseudo_views import PseudoView, only_pseudo
 
 # The number of far Gaussians as a share of the near ones', and the share of the distances in all
 # views that are below near_distance. Trained on photographs, far Gaussians are better than the
@@ -73,11 +73,11 @@ def with_far(
     if has_dial(base):
         raise ClodError(WITHOUT_FAR)
     views = spread(views, MOST_VIEWS)
-    pseudo = [isinstance(view, PseudoView) for view in views]
+    placed = only_pseudo(views)
     share, nearer, contrast = SHARE, NEARER, 1.0
-    if all(pseudo):
+    if placed:
         share, nearer, contrast = PLACED_SHARE, PLACED_NEARER, PLACED_CONTRAST
-    elif any(pseudo):
+    elif any(isinstance(view, PseudoView) for view in views):
         share = FEW_SHARE
     cameras = [view.camera for view in views]
     attenuation = config.attenuation(scene_distance(base, views))
@@ -85,7 +85,7 @@ def with_far(
     distances = torch.cat([normalized_distances(some, camera, attenuation) for camera in cameras])
     near = float(distances.kthvalue(max(round(nearer * len(distances)), 1)).values)
     error = removal_error(base, views, seed=config.seed, progress=progress)
-    if all(pseudo):  # such cameras do not show everything
+    if placed:  # such cameras do not show everything
         error = supposed_error(base, error)
     weights = (error.sqrt() * base.opacities).double() ** contrast
     far = merge(base, weights, max(round(share * len(base)), 1), progress)

@@ -13,6 +13,8 @@ from clod_adapter.gaussians import Gaussians, with_near
 from clod_adapter.progress import Listener
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.loop import Adapted, adapt
+from clod_adapter.training.near_distance import fit_near_distance
+from clod_adapter.training.pseudo_views import only_pseudo
 from clod_adapter.training.state import TrainingState
 
 RATES = {name: f"lr_{name}" for name in ("means", "quats", "scales", "opacities", "sh0")}
@@ -96,14 +98,18 @@ class Plan:
         resume: TrainingState | None = None,
         group: ProcessGroup | None = None,
     ) -> Adapted:
-        """``loop.adapt`` of ``start``; the result has the SH degrees that were left out again.
+        """``loop.adapt`` of ``start``; the result has the SH degrees that were left out again, and
+        without photographs the near_distance that is best at equal counts.
 
         The listener is given the Gaussians without them (``restore_excluded``).
         """
         adapted = adapt(self.start, scene, self.config, progress, resume, group=group)
+        gaussians = adapted.gaussians
+        if self.start.near is not None and not adapted.interrupted and only_pseudo(scene.train):
+            gaussians = fit_near_distance(gaussians, scene.train, progress)
         start_seconds = adapted.start_seconds + self.seconds["start"]
         return replace(
-            adapted, gaussians=self.restore_excluded(adapted.gaussians), start_seconds=start_seconds
+            adapted, gaussians=self.restore_excluded(gaussians), start_seconds=start_seconds
         )
 
     def restore_excluded(self, trained: Gaussians) -> Gaussians:

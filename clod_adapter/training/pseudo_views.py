@@ -77,6 +77,11 @@ class PseudoView(StoredView):
         return StoredView(camera, lambda: render(self.teacher, camera).pixels)
 
 
+def only_pseudo(views: Sequence[View]) -> bool:
+    """Whether there are no photographs."""
+    return all(isinstance(view, PseudoView) for view in views)
+
+
 @torch.no_grad()
 def render_pseudo_views(
     gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None

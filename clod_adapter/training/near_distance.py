@@ -1,0 +1,115 @@
+"""The distance at which far Gaussians take over, chosen after training, by pictures at equal
+counts.
+
+Where near Gaussians are dense, as in an aerial scene, a farther ``near_distance`` is better at
+every count; where they are few, a nearer one is. Before training nothing tells which: merged
+Gaussians are no measure of trained ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import View, spread
+from clod_adapter.equation.attenuation import kept_between
+from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.progress import Listener, Phase, Stopped, tell
+from clod_adapter.render import render
+
+BUDGETS = (0.4, 0.18, 0.08, 0.04)  # shares of the near Gaussians' number, as viewers have them
+MEASURED_VIEWS = 6
+STEP = 1.15  # factor between the distances that are tried
+MOST_STEPS = 8
+FARTHEST = 1e3  # end of the search for a dial value
+PRECISION = 1e-3  # of the dial value that meets a budget
+
+
+@torch.no_grad()
+def fit_near_distance(
+    gaussians: Gaussians, views: Sequence[View], progress: Listener | None = None
+) -> Gaussians:
+    """The Gaussians with the near_distance whose pictures differ least from those of the views.
+
+    Multiplies it by STEP, or divides, as long as that reduces the mean over BUDGETS of the
+    logarithm of the mean squared error, at equal counts. Budgets beyond ``max_sv`` do not count.
+    Where ``progress`` returns False, the best one so far is the result.
+    """
+    assert gaussians.attenuation is not None
+    views = spread(views, MEASURED_VIEWS)
+    images = [view.image / 255 for view in views]
+    distances = [
+        normalized_distances(gaussians.means, view.camera, gaussians.attenuation).double()
+        for view in views
+    ]
+    reached = [_share(gaussians, d, gaussians.attenuation.max_sv) for d in distances]
+    budgets = [budget for budget in BUDGETS if budget >= fmean(reached)]
+    tried = 0
+
+    def error(candidate: Gaussians) -> float:
+        nonlocal tried
+        tell(progress, Phase.NEAR_DISTANCE, tried, 2 * MOST_STEPS)
+        tried += 1
+        logs = list[float]()
+        for budget in budgets:
+            squares = list[float]()
+            for view, image, d in zip(views, images, distances, strict=True):
+                s = _dial_for(candidate, d, budget)
+                pixels = render(candidate, view.camera, virtual_scale=s).image.clamp(0, 1)
+                squares.append(float((pixels - image).square().mean()))
+            logs.append(math.log(max(fmean(squares), 1e-10)))
+        return fmean(logs)
+
+    if not budgets:
+        return gaussians
+    try:
+        least = error(gaussians)
+        for factor in (STEP, 1 / STEP):
+            start = gaussians
+            for _ in range(MOST_STEPS):
+                candidate = _with_near_distance(gaussians, factor)
+                found = error(candidate)
+                if found >= least:
+                    break
+                gaussians, least = candidate, found
+            if gaussians is not start:
+                break
+    except Stopped:
+        pass
+    return gaussians
+
+
+def _with_near_distance(gaussians: Gaussians, factor: float) -> Gaussians:
+    attenuation = gaussians.attenuation
+    assert attenuation is not None
+    near_distance = attenuation.near_distance * factor
+    return gaussians.replace(attenuation=replace(attenuation, near_distance=near_distance))
+
+
+def _share(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> float:
+    """What is kept as a share of the near Gaussians' number."""
+    begin, end = kept_between(gaussians, distances)
+    return int(((begin < virtual_scale) & (virtual_scale < end)).sum()) / gaussians.whole
+
+
+def _dial_for(gaussians: Gaussians, distances: Tensor, budget: float) -> float:
+    """The smallest dial value from 1 on that keeps at most this share."""
+    begin, end = kept_between(gaussians, distances)
+    count = budget * gaussians.whole
+
+    def fits(s: float) -> bool:
+        return int(((begin < s) & (s < end)).sum()) <= count
+
+    low = high = 1.0
+    while not fits(high) and high < FARTHEST:
+        low, high = high, 2 * high
+    while high / low > 1 + PRECISION:
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if fits(middle) else (middle, high)
+    return high
