@@ -1,20 +1,29 @@
 // The dial in PlayCanvas, and so in SuperSplat's engine: a work buffer modifier with the library's GLSL or WGSL.
 import { PIXELFORMAT_RGBA32F, Vec3, WORKBUFFER_UPDATE_ONCE } from "playcanvas";
-import { Dial, checked, claim, constants, texels } from "./dial.js";
+import { Dial, checked, claim, constants, release, texels } from "./dial.js";
 import { timed } from "./frame_rate.js";
 import { constantsOf, readSettings, revealed } from "./read.js";
 import { glsl, wgsl } from "./shaders.js";
 
 /** Attaches the dial of an adapted PLY to an entity with its gsplat; distances are from `camera`, an entity. */
 export function attach(app, entity, camera) {
-  const { gsplat } = entity, { resource } = gsplat, file = fileOf(resource.gsplatData);
   claim(entity);
+  try {
+    return dialOf(app, entity, camera);
+  } catch (error) {
+    release(entity);
+    throw error;
+  }
+}
+
+function dialOf(app, entity, camera) {
+  const { gsplat } = entity, { resource } = gsplat, file = fileOf(resource.gsplatData);
+  const world = camera.getPosition.bind(camera), place = new Vec3();
   resource.format.addExtraStreams([{ name: "clod", format: PIXELFORMAT_RGBA32F }]);
   const texture = resource.getTexture("clod");
   texture.lock().set(texels(file, 4 * texture.width * texture.height));
   texture.unlock();
   gsplat.setWorkBufferModifier(modifier(file));
-  const world = () => camera.getPosition(), place = new Vec3();
   const eye = () => {
     entity.getWorldTransform().clone().invert().transformPoint(world(), place);
     return [place.x, place.y, place.z];

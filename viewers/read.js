@@ -8,6 +8,9 @@ const TYPES = { // the other names are those of DataView, in lower case
 };
 const DEGREES = [0, 9, 24, 45, 72]; // f_rest columns by SH degree
 const NEEDED = "x y z rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2 opacity".split(" ");
+const NUMBER = String.raw`[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?`; // of a vertical axis, as in viewer/page.py
+const VERTICAL = new RegExp(String.raw`^\s*vertical axis:[\s\[]*([xyz]|${NUMBER}(?:[\s,]+${NUMBER}){2})[\s\]]*$`, "i");
+const NAMED = { x: [1, 0, 0], y: [0, -1, 0], z: [0, 0, 1] }; // Brush's y points down
 const VERTEX = /^element vertex (\d+)((?:\n(?:property|comment|obj_info) .*)*)/m;
 const CONVERTED = /^property \w+ (packed_|masks_|filter_3D|f_anchor_feat)|^element \w+ [^]*^element vertex/m; // other layouts
 
@@ -17,8 +20,8 @@ export async function readGaussians(bytes) {
     const magic = String.fromCharCode(...bytes.subarray(0, 3));
     if (magic === "ply") return revealed(readPly(bytes));
     if (magic.startsWith("\x1f\x8b")) {
-      const { attenuation, ...read } = await readSpz(bytes);
-      return revealed({ ...read, settings: attenuation && settingsOf(attenuation) });
+      const { attenuation, about, ...read } = await readSpz(bytes);
+      return revealed({ ...read, up: readUp(about), settings: attenuation && settingsOf(attenuation) });
     }
   } catch (error) {
     if (error.constructor === Error) throw error;
@@ -73,7 +76,7 @@ function readPly(bytes) {
     opacityLogits: read("opacity"), sh0: numbered("f_dc", 3), shN: read(...rest), sigmaD: hasDial ? read("sigma_d") : null,
     opacityD: hasDial && columns.has("opacity_d") ? read("opacity_d") : null,
     growthD: hasDial && columns.has("growth_d") ? read("growth_d") : null, settings: hasDial ? readSettings(comments, constants) : null,
-    screenFilter: readScreenFilter(comments, constants, hasDial), ...readCalibration(comments, count),
+    up: readUp(comments), screenFilter: readScreenFilter(comments, constants, hasDial), ...readCalibration(comments, count),
   };
 }
 
@@ -91,6 +94,14 @@ function settingsOf(stored) {
   }
   if (settings.form === "ours") return settings;
   throw new Error("its dial is of the paper's form, which viewers do not draw; adapt it without --form paper");
+}
+
+/** The vertical axis that the last comment of nerfstudio or Brush states, of length 1; null without one. */
+function readUp(comments) {
+  const stated = comments.map((comment) => VERTICAL.exec(comment)?.[1].toLowerCase()).filter(Boolean);
+  const axes = stated.map((text) => NAMED[text] ?? text.split(/[\s,]+/).map(Number));
+  const axis = axes.findLast((numbers) => Math.hypot(...numbers) > 0 && Math.hypot(...numbers) < Infinity);
+  return axis ? axis.map((value) => value / Math.hypot(...axis)) : null;
 }
 
 /** The screen-space filter from comments, ours or another program's, or from columns; as in io/settings.py. */

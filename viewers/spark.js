@@ -10,10 +10,14 @@ const WIDTH = 2048; // of the texture
 /** Attaches the dial of an adapted PLY or SPZ, whose `bytes` the SplatMesh was made from (without `lod`). */
 export async function attach(mesh, bytes, renderer) {
   claim(mesh);
-  const file = await read(mesh, bytes).catch((error) => {
+  return dialOf(mesh, bytes, renderer).catch((error) => {
     release(mesh);
     throw error;
   });
+}
+
+async function dialOf(mesh, bytes, renderer) {
+  const file = await read(mesh, bytes);
   const height = Math.ceil(file.count / WIDTH);
   const texture = new DataTexture(texels(file, 4 * WIDTH * height), WIDTH, height, RGBAFormat, FloatType);
   texture.needsUpdate = true;

@@ -17,9 +17,9 @@ export async function readSpz(file) {
   const read = (stride, value) => new Float32Array(stride * count).map((_, k) => value(k));
   const quats = new Float32Array(4 * count);
   for (let i = 0; i < count; i++) quats.set(version === 3 ? quatOfBits(view.getUint32(rotations + 4 * i, true)) : quatOfBytes(bytes, rotations + 3 * i), 4 * i);
-  const { metadata: { attenuation = null, screen_filter: screenFilter, calibration } = {}, columns } = recordOf(bytes, view, count, end);
+  const { metadata: { attenuation = null, screen_filter: screenFilter, calibration, about = [] } = {}, columns } = recordOf(bytes, view, count, end);
   return {
-    count, degree, quats, sigmaD: columns.sigma_d ?? null, growthD: columns.growth_d ?? null, opacityD: columns.opacity_d, attenuation,
+    count, degree, quats, sigmaD: columns.sigma_d ?? null, growthD: columns.growth_d ?? null, opacityD: columns.opacity_d, attenuation, about,
     means: read(3, (k) => {
       const at = means + 3 * k, raw = bytes[at] | (bytes[at + 1] << 8) | (bytes[at + 2] << 16);
       return ((raw << 8) >> 8) * unit; // 24-bit fixed point

@@ -48,6 +48,10 @@ ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
 POSTER_SIDE = 512  # pixels of the picture shown while the page loads
 POSTER_QUALITY = 60  # of its JPEG
+# What nerfstudio and Brush state as the vertical axis, in numbers or by name; as viewers/read.js.
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
+VERTICAL = rf"(?i)\s*vertical axis:[\s\[]*([xyz]|{NUMBER}(?:[\s,]+{NUMBER}){{2}})[\s\]]*"
+NAMED = {"x": "1 0 0", "y": "0 -1 0", "z": "0 0 1"}  # Brush's y points down
 # Settings of up_axis, as in web/src/model.js.
 UPS = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))  # first guesses
 FLAT = math.log(2)  # least logarithm of the ratio of a flat Gaussian's least two scales
@@ -67,6 +71,7 @@ class Payload:
     gaussians: Gaussians
     calibration: Calibration | None = None
     origin: Origin = NOWHERE
+    about: tuple[str, ...] = ()  # comments on the vertical axis
 
     @classmethod
     def of(cls, checkpoint: Checkpoint) -> "Payload":
@@ -76,9 +81,9 @@ class Payload:
                 f"{checkpoint.path}: its dial is of the paper's form, which viewers do not draw;"
                 " adapt it without --form paper"
             )
-        return cls(
-            as_text(checkpoint.path.name), gaussians, checkpoint.calibration, checkpoint.origin
-        )
+        about = tuple(line for line in checkpoint.comments if re.fullmatch(VERTICAL, line))
+        name = as_text(checkpoint.path.name)
+        return cls(name, gaussians, checkpoint.calibration, checkpoint.origin, about)
 
     @cached_property
     def header(self) -> bytes:
@@ -86,7 +91,8 @@ class Payload:
         g = self.gaussians
         names = inria_dtype(g.sh_degree, dial=dial_columns(g.tensors())).names or ()
         row = np.zeros((), [(name, "<f4") for name in names if name not in ("nx", "ny", "nz")])
-        comments = write_comments(Metadata(g.attenuation, g.screen_filter, self.calibration))
+        settings = Metadata(g.attenuation, g.screen_filter, self.calibration, about=self.about)
+        comments = write_comments(settings)
         element = PlyElement.describe(np.broadcast_to(row, len(g)), "vertex", comments=comments)
         return f"{PlyData([element], byte_order='<').header}\n".encode("ascii")
 
@@ -127,7 +133,7 @@ class Payload:
         """
         rows = _along_curve(self.gaussians.means)
         try:
-            metadata = Metadata(calibration=self.calibration, origin=self.origin)
+            metadata = Metadata(calibration=self.calibration, origin=self.origin, about=self.about)
             notes = write(file, self.gaussians.select(rows), metadata)
             gaussians = load(file, origin=self.origin).gaussians
             gaussians = gaussians.to(self.gaussians.means.device)
@@ -221,7 +227,9 @@ def write_viewer_page(
         else:
             data, gaussians, notes = payload.packed(f"{temporary}.spz")
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
-        first = cameras[:1] if not placed else [levelled(cameras[0], up_axis(gaussians))]
+        first = cameras[:1]
+        if placed:
+            first = [levelled(cameras[0], up_axis(gaussians, payload.about))]
         poster = _poster(gaussians, first[0], opening) if first else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
         with open(temporary, "wb") as file:
@@ -256,8 +264,16 @@ def levelled(camera: Camera, axis: np.ndarray) -> Camera:
     return replace(camera, viewmat=looking(camera.position, ahead, -up))
 
 
-def up_axis(gaussians: Gaussians) -> np.ndarray:
-    """The direction that flat Gaussians face, a ground or a table, as in web/src/model.js."""
+def up_axis(gaussians: Gaussians, comments: Sequence[str] = ()) -> np.ndarray:
+    """The axis that the last comment states, else the direction that flat Gaussians face, a ground
+    or a table, as in web/src/model.js.
+    """
+    stated = [re.fullmatch(VERTICAL, comment) for comment in reversed(comments)]
+    for match in filter(None, stated):
+        text = match[1].lower()
+        up = np.array(re.findall(NUMBER, NAMED.get(text, text)), np.float64)
+        if 0 < (length := np.linalg.norm(up)) < math.inf:
+            return up / length
     g = gaussians.to("cpu")
     means = float64_array(g.means)
     scales = np.sort(g.log_scales.numpy(), axis=1)

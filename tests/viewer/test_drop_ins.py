@@ -249,6 +249,36 @@ def test_the_examples_show_errors(tabs, viewer, tmp_path):
         assert "none.ply: " in page.inner_text("p")
 
 
+@pytest.mark.parametrize(
+    "viewer, given, failing",
+    [
+        ("spark", "made, bytes, renderer", "attach(made, bytes.slice(9))"),
+        ("spark", "made, bytes, renderer", "attach(Object.assign(made, { context: null }), bytes)"),
+        ("playcanvas", "app, made, camera", "attach(app, made)"),
+    ],
+)
+def test_a_dial_is_attached_where_attaching_failed_before(tabs, viewer, given, failing):
+    """By damaged bytes, a mesh without a context, or a missing camera."""
+    make = {
+        "spark": "new mesh.constructor({ fileBytes: bytes.slice() })",
+        "playcanvas": "splat.clone()",
+    }
+    script = f"""async () => {{
+        const made = {make[viewer]};
+        await made.initialized;
+        if (window.app) app.root.addChild(made);
+        const {{ context }} = made;
+        const failed = await Promise.resolve().then(() => {failing}).catch(String);
+        made.context = context;
+        return [failed, (await attach({given})).file.count];
+    }}"""
+    with opened(tabs, viewer, KIT / "kit.ply") as page:
+        page.wait_for_function("window.dial")
+        failed, count = page.evaluate(script)
+        assert "Error" in failed
+        assert count == page.evaluate("dial.file.count")
+
+
 def test_dials_that_hold_a_rate_share_the_frame(tabs):
     """They turn together, until the frame is fast enough."""
     script = """async () => {

@@ -73,7 +73,7 @@ function half(value) {
 
 /** A ball about the median with 98 % of a sample or, where that has twice the radius of 80 % by a background, with these. */
 function extentOf(gaussians) {
-  const { means, logScales } = gaussians, step = 3 * Math.max(Math.floor(means.length / 60000), 1), all = [];
+  const { means, logScales, up } = gaussians, step = 3 * Math.max(Math.floor(means.length / 60000), 1), all = [];
   for (let at = 0; at < means.length; at += step) {
     const size = VISIBLE * Math.exp(Math.max(...logScales.subarray(at, at + 3)));
     all.push({ row: at / 3, point: means.subarray(at, at + 3), size });
@@ -83,7 +83,7 @@ function extentOf(gaussians) {
   const reaches = Float64Array.from(all, ({ reach }) => reach).sort(), share = (part) => reaches[Math.floor(part * all.length)];
   const radius = share(0.98) < 2 * share(0.8) ? share(0.98) : share(0.8);
   const near = all.filter(({ reach }) => reach <= radius).map(({ row }) => row);
-  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up: upOf(gaussians, near) };
+  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up: up ?? upOf(gaussians, near), isStated: Boolean(up) };
 }
 
 /** The direction that flat Gaussians face, a ground or a table: from the first of UPS that has some, to the mean within 36 degrees. */

@@ -39,7 +39,8 @@ function update() {
   elements.move.textContent = viewer.flying ? "Fly" : "Orbit";
   elements.canvas.classList.toggle("flying", viewer.flying);
   elements.up.value = viewer.up;
-  elements.up.options[0].textContent = viewer.photographs.length ? "as in the photographs" : "found from the scene";
+  elements.up.options[0].textContent = viewer.photographs.length ? "as in the photographs"
+    : model?.extent.isStated ? "as the file states" : "found from the scene";
   elements.cameraRow.hidden = !viewer.cameras.length;
   elements.play.classList.toggle("playing", views.isRunning());
   elements.turn.textContent = views.isRunning() ? "Stop" : "Turntable";
