@@ -95,17 +95,24 @@ def test_train_and_test_split(tmp_path):
 
 
 def test_split_of_the_scene_is_used(tmp_path):
+    """Names in test.txt; other folders and suffixes, where only one name is meant; and others."""
     names = sorted(write_scene(tmp_path, 10)[1])
-    for listed, note in (
-        ([names[2], names[9], "other.png"], "held out are 2 photographs, those of test.txt"),
-        (["other.png"], "test.txt holds out none of the photographs and is not used"),
-        (names, "test.txt holds out all of the photographs and is not used"),
+    held = "held out are 2 photographs, those of test.txt"
+    unknown = "names in test.txt are of no photograph, such as other.png"
+    none = "test.txt holds out none of the photographs and is not used"
+    there = f"/there/images/{names[9].rsplit('.')[0].upper()}.JPEG"
+    for lines, notes, want in (
+        (["# of 2026", names[2], "", names[9], "other.png"], (held, unknown), [2, 9]),
+        (["\ufeff" + names[2].rsplit(".")[0], there.replace("/", "\\")], (held,), [2, 9]),
+        (["other.png"], (none, unknown), [0, 8]),
+        (names, (none.replace("none", "all"),), [0, 8]),
     ):
-        (tmp_path / "sparse" / "0" / "test.txt").write_text("\n".join(listed) + "\n")
+        text = "\r\n".join(lines)
+        (tmp_path / "sparse" / "0" / "test.txt").write_text(text, "utf-8")
         loaded, cameras = load_scene(tmp_path), load_cameras(tmp_path, training=True)[0]
         held_out = names_of(loaded.test)
-        assert loaded.notes == (note,)
-        assert held_out == (listed[:2] if len(listed) == 3 else [names[0], names[8]])
+        assert loaded.notes == notes
+        assert held_out == [names[k] for k in want]
         assert [camera.name for camera in cameras] == [
             name for name in names if name not in held_out
         ]
@@ -146,11 +153,13 @@ def test_other_models_are_found_and_noted(tmp_path):
 
 
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
-def test_records_beyond_the_file_are_refused(tmp_path, file):
+def test_another_number_of_records_than_stated_is_refused(tmp_path, file):
     path = model_of(tmp_path, **PINHOLES) / f"{file}.bin"
     data = path.read_bytes()
-    counts = [count.to_bytes(8, "little") + data[8:] for count in (1 << 31, (1 << 64) - 1)]
-    for content in (*counts, b"", data[: len(data) // 2], data[:-1]):
+    stated = int.from_bytes(data[:8], "little")
+    counts = (stated - 1, stated + 1, 1 << 31, (1 << 64) - 1)
+    miscounted = [count.to_bytes(8, "little") + data[8:] for count in counts]
+    for content in (*miscounted, b"", data[: len(data) // 2], data[:-1], data + b"a"):
         path.write_bytes(content)
         with refused(f"{file}.bin: is truncated or damaged"):
             (load_points if file == "points3D" else load_scene)(tmp_path)

@@ -103,7 +103,9 @@ def test_lists_of_nerfstudio_are_its_split(tmp_path):
     frames = [frame(i, name) for i, name in enumerate(names)]
     write_images(tmp_path, [f"{name}.png" for name in names])
     both = {"val_filenames": names[1:2], "test_filenames": names[4:5]}
-    for lists, want in (({"train_filenames": names[2:], **both}, [0, 1]), (both, [1, 4])):
+    elsewhere = {"val_filenames": ["1.JPG"], "test_filenames": ["/there/images/4.png"]}
+    training = {"train_filenames": names[2:], **both}
+    for lists, want in ((training, [0, 1]), (both, [1, 4]), (elsewhere, [1, 4])):
         write_frames(tmp_path, frames, **INTRINSICS, **lists)
         loaded = load_scene(tmp_path)
         assert names_of(loaded.test) == [f"images/{i}.png" for i in want]

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence, Set
+from codecs import BOM_UTF8
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from clod_adapter._support.text import as_text
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.file_formats import read_bytes, reject_long_numbers
 from clod_adapter.io.scene.folder import FORMS, find_cameras, form_of, name_parts
@@ -80,17 +83,35 @@ def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
 
 
 def marked(
-    images: list[PosedImage], testing: Set[str], source: str
+    images: list[PosedImage], entries: Iterable[str], source: str, *, training: bool = False
 ) -> tuple[list[PosedImage], list[str]]:
-    """The images, those of these names held out, and a note; unchanged where the names are those of
-    all or none.
+    """The images, those held out that a list has (``training``: has not), and notes; unchanged
+    where these are all or none.
+
+    An entry may have another folder or suffix where only one name is the same otherwise.
     """
-    count = sum(image.name in testing for image in images)
-    if not 0 < count < len(images):
-        extent = "all" if count else "none"
-        return images, [f"{source} holds out {extent} of the photographs and is not used"]
-    note = f"held out are {count} photographs, those of {source}"
-    return [replace(image, held_out=image.name in testing) for image in images], [note]
+    names = [image.name for image in images]
+    count = Counter(map(_stem, names))
+    known = {_stem(name): name for name in names if count[_stem(name)] == 1}
+    known |= {name: name for name in names}
+    named = {
+        known.get(PureWindowsPath(entry).as_posix(), known.get(_stem(entry))): entry
+        for entry in entries
+    }
+    notes = []
+    if None in named:
+        notes.append(f"names in {source} are of no photograph, such as {as_text(named[None])}")
+    testing = [(name in named) != training for name in names]
+    if len(set(testing)) == 1:
+        extent = "all" if testing[0] else "none"
+        return images, [f"{source} holds out {extent} of the photographs and is not used", *notes]
+    notes.insert(0, f"held out are {sum(testing)} photographs, those of {source}")
+    marks = zip(images, testing, strict=True)
+    return [replace(image, held_out=mark) for image, mark in marks], notes
+
+
+def _stem(name: str) -> str:
+    return PureWindowsPath(name).stem.casefold()
 
 
 def check_posed(image: PosedImage, source: Path) -> PosedImage:
@@ -145,8 +166,8 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
         )
     split = model / SPLIT
     if split.is_file():
-        lines = read_bytes(split).decode("utf-8-sig", "surrogateescape").splitlines()
-        posed, split_notes = marked(posed, {line.strip() for line in lines}, SPLIT)
+        entries = [line.decode("utf-8", "surrogateescape") for _, line in _lines(split)]
+        posed, split_notes = marked(posed, entries, SPLIT)
         notes += split_notes
     return posed, notes
 
@@ -196,6 +217,12 @@ class _Records:
         self.at = end + 1
         return self.data[start:end].decode("utf-8", "surrogateescape")
 
+    def each(self) -> Iterator[int]:
+        """The numbers of the records that the file states; rejects bytes after the last."""
+        yield from range(*self.take("Q"))
+        if self.at < len(self.data):
+            raise ValueError(f"{len(self.data) - self.at} bytes after the records that it states")
+
     def skip(self, size: int) -> None:
         self.at += size
         if self.at > len(self.data):
@@ -204,7 +231,7 @@ class _Records:
 
 def _camera_records(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
     records = _Records(path)
-    for _ in range(*records.take("Q")):
+    for _ in records.each():
         number, kind, *size = records.take("IiQQ")
         camera = pycolmap.Camera.create_from_model_id(
             number, pycolmap.CameraModelId(kind), 1.0, *size
@@ -214,7 +241,7 @@ def _camera_records(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]
 
 def _images(path: Path) -> Iterator[Image]:
     records = _Records(path)
-    for _ in range(*records.take("Q")):
+    for _ in records.each():
         _, *pose, camera = records.take("I7dI")
         yield Image(records.take_name(), pose[:4], pose[4:], camera)
         records.skip(24 * records.take("Q")[0])  # keypoints
@@ -222,7 +249,7 @@ def _images(path: Path) -> Iterator[Image]:
 
 def _points(path: Path) -> Iterator[Sequence[float]]:
     records = _Records(path)
-    for _ in range(*records.take("Q")):
+    for _ in records.each():
         # number, position, colour, error, count of observations
         point = records.take("Q3d3BdQ")
         yield point[1:4]
@@ -231,7 +258,7 @@ def _points(path: Path) -> Iterator[Sequence[float]]:
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
     """Number and content of the lines that are neither blank nor comments."""
-    text = read_bytes(path)
+    text = read_bytes(path).removeprefix(BOM_UTF8)
     reject_long_numbers(path, text)
     for number, line in enumerate(map(bytes.strip, text.splitlines()), start=1):
         if line and not line.startswith(b"#"):

@@ -4,10 +4,11 @@
 
 import math
 from collections import ChainMap
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -78,14 +79,13 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
         raise ClodError(
             f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json"
         )
-    listed = []
+    paths = []
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
-        listed.append("/".join(name_parts(frame["file_path"], path, path.parent)))
-    names = [with_ending(path.parent, name) or name for name in listed]
+        paths.append("/".join(name_parts(frame["file_path"], path, path.parent)))
+    names = [with_ending(path.parent, name) or name for name in paths]
     files, _ = find_files(path.parent, [tuple(name.split("/")) for name in names])
-    is_test = _split(path, content)
     images = []
     for frame, name, file in zip(frames, names, files, strict=True):
         where = f"{path}: frame {name}"
@@ -96,9 +96,8 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
         viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
         images.append(check_posed(PosedImage(name, viewmat, camera, held_out), path))
     notes: list[str] = []
-    if is_test and held_out is None:
-        testing = {name for key, name in zip(listed, names, strict=True) if is_test(key)}
-        images, notes = marked(images, testing, f"the lists of {path.name}")
+    if held_out is None and any(content.get(key) is not None for key in LISTS):
+        images, notes = _split(path, content, images)
     if any(leaves(frame["file_path"]) for frame in frames):
         notes.append(f"paths of {path.name} lead out of its folder: photographs are those in it")
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
@@ -111,20 +110,20 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     return images, notes
 
 
-def _split(path: Path, content: Mapping[str, Any]) -> Callable[[str], bool] | None:
-    """Whether nerfstudio's lists hold out a photograph: it does not train on it; None without
-    lists.
-    """
-    lists = {}
-    for key in LISTS:
-        listed = content.get(key)
-        if listed is not None:
-            if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-                raise ClodError(f"{path}: {key} is no list of file names; correct or remove it")
-            lists[key] = {"/".join(name_parts(name, path, path.parent)) for name in listed}
-    if "train_filenames" in lists:
-        return lambda name: name not in lists["train_filenames"]
-    return (lambda name: any(name in names for names in lists.values())) if lists else None
+def _split(
+    path: Path, content: Mapping[str, Any], images: list[PosedImage]
+) -> tuple[list[PosedImage], list[str]]:
+    """The images, those held out on which nerfstudio does not train by its lists, and notes."""
+    lists = {key: content[key] for key in LISTS if content.get(key) is not None}
+    for key, entries in lists.items():
+        if not isinstance(entries, list) or not all(isinstance(name, str) for name in entries):
+            raise ClodError(f"{path}: {key} is no list of file names; correct or remove it")
+        lists[key] = [with_ending(path.parent, name) or name for name in entries]
+    source = f"the lists of {path.name}"
+    training = lists.pop(LISTS[0], None)
+    if training is not None:
+        return marked(images, training, source, training=True)
+    return marked(images, chain(*lists.values()), source)
 
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
