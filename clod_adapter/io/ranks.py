@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Sequence
 from glob import escape
+from itertools import chain
 from pathlib import Path
 
 from clod_adapter.errors import ClodError, rejected_if_damaged
@@ -54,5 +55,6 @@ def joined(path: Path, sources: Sequence[Source]) -> Source:
         source_rows = [source.rows for source in sources if source.rows is not None]
         rows = np.concatenate(source_rows) if source_rows else None
     digest = hashlib.sha256("".join(source.sha256 for source in sources).encode()).hexdigest()
+    notes = dict.fromkeys(chain(*(source.notes for source in sources)))
     note = f"its {len(sources)} ranks, in files beside it, are read as one checkpoint"
-    return first._replace(arrays=arrays, rows=rows, notes=(*first.notes, note), sha256=digest)
+    return first._replace(arrays=arrays, rows=rows, notes=(*notes, note), sha256=digest)

@@ -371,7 +371,8 @@ def test_ranks_of_several_gpus(tmp_path, name):
     for rank, path in enumerate(paths):
         part = g.select(torch.arange(10) + 10 * rank)
         if path.suffix == ".pt":
-            torch.save({"splats": to_gsplat(part)}, path)
+            corrections = {"pose_adjust": {}} if rank == 1 else {}
+            torch.save({"splats": to_gsplat(part), **corrections}, path)
         else:
             write_rows(path, inria_rows(part))
     for other in (name.replace("_r", "0_r"), name.replace("{}", "_").replace("ws3", "ws4")):
@@ -380,6 +381,7 @@ def test_ranks_of_several_gpus(tmp_path, name):
     assert all(each.gaussians == g for each in found)
     assert len({each.fingerprint for each in found}) == 1
     assert found[0].notes[-1] == "its 3 ranks, in files beside it, are read as one checkpoint"
+    assert any("(pose_adjust)" in note for note in found[0].notes) == (path.suffix == ".pt")
     with refused("is the input file"):
         save(paths[2], g, found[0])
     save(tmp_path / "out.ply", g, found[0])

@@ -234,7 +234,7 @@ def test_text_models_of_other_programs(tmp_path):
             number, *quat, rest = line.split(maxsplit=5)
             images.append(" ".join([number, *(str(1.02 * float(value)) for value in quat), rest]))
     for end in ("\n", "\n\n", "\n1.5 2.5 -1 3 4 7\n", "\r\n\r\n"):
-        file.write_text("\n".join(header) + "\n" + end.join(images))
+        file.write_text("\ufeff" + "\n".join(header) + "\n" + end.join(images), "utf-8")
         loaded = load_scene(tmp_path)
         assert loaded.notes == () and len(load_points(tmp_path)) == 0
         for view in (*loaded.train, *loaded.test):
@@ -273,14 +273,15 @@ def test_missing_images_are_noted_or_refused(tmp_path):
         load_scene(tmp_path)
 
 
-def test_masks_are_noted(tmp_path):
+@pytest.mark.parametrize("name", ["masks", "Mask", "images_masks"])
+def test_masks_are_noted(tmp_path, name):
     write_scene(tmp_path, 2)
-    write_images(tmp_path / "masks", ["sub/001.png.png", "sub/002.png.png"])
+    write_images(tmp_path / name, ["sub/001.png.png", "sub/002.png.png"])
     note = (
-        f"the masks in {tmp_path / 'masks'} are not used: where the checkpoint is empty under them,"
+        f"the masks in {tmp_path / name} are not used: where the checkpoint is empty under them,"
         " put them into the"
     )
-    for folder in (tmp_path, tmp_path / "sparse" / "0"):
+    for folder in (tmp_path, tmp_path / "sparse" / "0", tmp_path / "images"):
         assert load_scene(folder).notes == (f"{note} photographs' alpha channel",)
 
 
@@ -306,21 +307,22 @@ def test_smaller_copies_replace_missing_images(tmp_path):
 
 
 def test_photographs_of_another_suffix_or_case_are_found(tmp_path):
-    """One for each name: of two that differ in nothing else, or are claimed by two names, none is
-    taken.
+    """With accents apart too. One for each name: of two that differ in nothing else, or are claimed
+    by two names, none is taken.
     """
-    names = ["a.JPG", "b.png", "C/c.png", "d.png", "d.jpg", "e.png", "f.png"]
+    names = ["a.JPG", "b.png", "C/c.png", "d.png", "d.jpg", "e.png", "\u00e9.png"]
     write_model(tmp_path, [camera(i) for i in range(7)], names)
     write_images(
-        tmp_path / "images", ["A.png", "b.PNG", "C/c.tif", "d.webp", "e.jpg", "e.bmp", "f.png"]
+        tmp_path / "images",
+        ["A.png", "b.PNG", "C/c.tif", "d.webp", "e.jpg", "e.bmp", "e\u0301.png"],
     )
     loaded = load_scene(tmp_path)
     found = views_of(loaded)
-    assert names_of(found) == ["C/c.png", "a.JPG", "b.png", "f.png"]
+    assert names_of(found) == ["C/c.png", "a.JPG", "b.png", "\u00e9.png"]
     for view, seed in zip(found, (2, 0, 1, 6), strict=True):
         assert_array_equal(view.image, pixels(seed))
     assert loaded.notes == (
-        "3 of 7 photographs have another suffix or case, such as c.tif in images",
+        "4 of 7 photographs have another suffix or case, such as c.tif in images",
         "3 of 7 photographs are missing and left out (d.jpg, d.png, e.png)",
     )
 

@@ -12,6 +12,7 @@ from itertools import product
 from os.path import isfile
 from pathlib import Path, PureWindowsPath
 from typing import Any
+from unicodedata import normalize
 
 from clod_adapter._support.text import as_text, file_name
 from clod_adapter.errors import ClodError, rejected_if_damaged
@@ -29,7 +30,7 @@ MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 SMALLER = ("images_2", "images_4", "images_8")
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
 NAMES = ("images", *SMALLER, RAW)  # of folders of photographs, the likeliest first
-MASKS = ("masks", "mask")
+MASKS = "*[Mm][Aa][Ss][Kk]*"  # folders of masks
 # what is said of masks
 UNUSED = (
     "not used: where the checkpoint is empty under them, put them into the photographs' alpha"
@@ -117,10 +118,11 @@ def find_photographs(
         )
     if root.name in (*SMALLER, RAW) and root != folder:
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
-    if cameras.is_dir() and root != folder:
-        for base, name in product(dict.fromkeys((folder, root.parent)), MASKS):
-            if any((base / name).glob("*")):
-                notes.append(f"the masks in {base / name} are {UNUSED}")
+    if cameras.is_dir():
+        beside = root.parent if root.name in NAMES else root
+        for masks in sorted(beside.glob(MASKS)):
+            if any(masks.glob("*")):
+                notes.append(f"the masks in {masks} are {UNUSED}")
     missing = [
         as_text(str(Path(*name)))
         for name, path in zip(split_names, paths, strict=True)
@@ -168,7 +170,8 @@ def find_files(
 
 
 def _without_suffix(path: Path) -> Path:
-    return path.with_name(path.stem.casefold())
+    # macOS has letters and their accents apart
+    return path.with_name(normalize("NFC", path.stem).casefold())
 
 
 def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str, ...]:
