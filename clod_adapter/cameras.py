@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain, product
+from itertools import chain
 from numbers import Integral
-from operator import mul
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -130,11 +129,9 @@ def numbers_of(name: str, values: Any) -> Tensor:
 def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]]) -> None:
     """Rejects what is no pinhole camera."""
     (fx, skew, _), (other_skew, fy, _), last = K
-    axes = [row[:3] for row in viewmat[:3]]
-    bent = []
-    for i, j in product(range(3), repeat=2):
-        bent.append(abs(sum(map(mul, axes[i], axes[j])) - (i == j)))
-    moves = max(bent) < BENT and viewmat[3] == [0, 0, 0, 1]
+    turn = torch.tensor(viewmat, dtype=torch.float64)[:3, :3]
+    bent = (turn @ turn.T - torch.eye(3).to(turn)).abs().max()
+    moves = bent < BENT and viewmat[3] == [0, 0, 0, 1]
     for ok, defect in (
         (all(map(math.isfinite, chain(*viewmat, *K))), "a value that is not finite"),
         (moves, "a viewmat that is no rotation and translation"),

@@ -94,7 +94,8 @@ def dial_for(
         f"a {type(gaussians).__name__}",
         "of type Gaussians",
     )
-    if isinstance(cameras, Place) or not all(isinstance(each, Place) for each in cameras or ()):
+    places = isinstance(cameras, Sequence) and all(isinstance(each, Place) for each in cameras)
+    if cameras and not places:
         raise ClodError(
             "cameras must be a list of cameras or viewpoints; of views [view.camera for view in"
             " views]"

@@ -65,6 +65,7 @@ class Mixture:
         )
 
 
+@np.errstate(under="ignore")
 def merge(
     gaussians: Gaussians, importance: Tensor, count: int, progress: Listener | None = None
 ) -> Gaussians:

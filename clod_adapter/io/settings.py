@@ -154,7 +154,7 @@ def _note_unknown(stored: Mapping[str, Any], known_names: Any, notes: list[str])
 # tensors.
 _METHODS = {
     r"trbf_\w+|motion_\w+|omega_\d+|f_t_\d+": "SpacetimeGaussians, which move and fade with time",
-    r"t|times?|t_scale|scale_t(_\d+)?|rot_r_\d+|durations?|velocit\w+": (
+    r"t|times|t_scale|scale_t(_\d+)?|rot_r_\d+|durations?|velocit\w+": (
         "a 4D method, whose Gaussians move and fade with time"
     ),
     r"sg_\w+|\w*asg_\w+": "spherical Gaussians, lobes that are added to the colour",

@@ -50,7 +50,9 @@ POSTER_SIDE = 512  # pixels of the picture shown while the page loads
 POSTER_QUALITY = 60  # of its JPEG
 # What nerfstudio and Brush state as the vertical axis, in numbers or by name; as viewers/read.js.
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
-VERTICAL = rf"(?i)\s*vertical axis:[\s\[]*([xyz]|{NUMBER}(?:[\s,]+{NUMBER}){{2}})[\s\]]*"
+VERTICAL = re.compile(
+    rf"(?i)\s*vertical axis:[\s\[]*([xyz]|{NUMBER}(?:[\s,]+{NUMBER}){{2}})[\s\]]*"
+)
 NAMED = {"x": "1 0 0", "y": "0 -1 0", "z": "0 0 1"}  # Brush's y points down
 # Settings of up_axis, as in web/src/model.js.
 UPS = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))  # first guesses
@@ -81,7 +83,7 @@ class Payload:
                 f"{checkpoint.path}: its dial is of the paper's form, which viewers do not draw;"
                 " adapt it without --form paper"
             )
-        about = tuple(line for line in checkpoint.comments if re.fullmatch(VERTICAL, line))
+        about = tuple(filter(VERTICAL.fullmatch, checkpoint.comments))
         name = as_text(checkpoint.path.name)
         return cls(name, gaussians, checkpoint.calibration, checkpoint.origin, about)
 
@@ -227,10 +229,10 @@ def write_viewer_page(
         else:
             data, gaussians, notes = payload.packed(f"{temporary}.spz")
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
-        first = cameras[:1]
-        if placed:
-            first = [levelled(cameras[0], up_axis(gaussians, payload.about))]
-        poster = _poster(gaussians, first[0], opening) if first else ""
+        first = cameras[0] if cameras else None
+        if first and placed:
+            first = levelled(first, up_axis(gaussians, payload.about))
+        poster = _poster(gaussians, first, opening) if first else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
         with open(temporary, "wb") as file:
             file.writelines(document(config, _elements(data), meta, poster))
@@ -268,20 +270,15 @@ def up_axis(gaussians: Gaussians, comments: Sequence[str] = ()) -> np.ndarray:
     """The axis that the last comment states, else the direction that flat Gaussians face, a ground
     or a table, as in web/src/model.js.
     """
-    stated = [re.fullmatch(VERTICAL, comment) for comment in reversed(comments)]
-    for match in filter(None, stated):
+    for match in filter(None, map(VERTICAL.fullmatch, reversed(comments))):
         text = match[1].lower()
         up = np.array(re.findall(NUMBER, NAMED.get(text, text)), np.float64)
-        if 0 < (length := np.linalg.norm(up)) < math.inf:
+        length = np.linalg.norm(up)
+        if 0 < length < math.inf:
             return up / length
     g = gaussians.to("cpu")
-    means = float64_array(g.means)
     scales = np.sort(g.log_scales.numpy(), axis=1)
-    offsets = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     flat = scales[:, 0] + FLAT < scales[:, 1]
-    flat &= offsets <= np.quantile(offsets, 0.98)
-    if not flat.any():
-        return np.array(UPS[0])
     axes = rotations(g.quats[torch.from_numpy(flat)].double()).numpy()
     thin = g.log_scales.numpy()[flat].argmin(axis=1)
     normals = axes[np.arange(len(axes)), :, thin]

@@ -249,7 +249,7 @@ def test_bad_arguments_are_refused():
             ({"keep": wrong}, re.escape(f"keep is {wrong}, it must be a positive, finite number"))
             for wrong in ("5", [1.0], torch.ones(2), 10**400)
         ),
-        *(({"keep": 3, "cameras": wrong}, lists) for wrong in (camera, [view], "abc")),
+        *(({"keep": 3, "cameras": wrong}, lists) for wrong in (camera, [view], "abc", 5)),
         ({"keep": 1, "cameras": ()}, "no camera"),
         ({"fps": 1, "cameras": ()}, "a calibration or cam"),
     ):

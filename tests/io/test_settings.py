@@ -289,7 +289,7 @@ def test_file_without_settings_has_a_note(tmp_path):
     [
         (["trbf_center", "trbf_scale", "motion_0", "motion_8", "omega_3"], "SpacetimeGaussians"),
         (["t", "scale_t_0", "rot_r_3"], "a 4D method"),
-        (["time", "t_scale"], "a 4D method"),
+        (["times", "t_scale"], "a 4D method"),
         (["sg_axis_0", "sg_sharpness_0"], "spherical Gaussians"),
         (["beta", "sb_params_5"], "Beta Splatting"),
         (["roughness", "base_color_1"], "materials"),

@@ -86,6 +86,9 @@ def test_merging_keeps_mass_and_centre():
     one = merge(twins, torch.ones(100), 50)
     places = [{*map(tuple, g.means.round(decimals=4).tolist())} for g in (one, model[:50])]
     assert places[0] == places[1]
+    faint = model.replace(sh0=model.sh0 * 1e-25)
+    with np.errstate(all="raise"):
+        assert len(merge(faint, torch.ones(400), 100)) == 100
 
 
 def test_near_ones_are_the_checkpoint(adapted, both):

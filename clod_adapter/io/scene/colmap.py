@@ -93,7 +93,7 @@ def marked(
     names = [image.name for image in images]
     count = Counter(map(_stem, names))
     known = {_stem(name): name for name in names if count[_stem(name)] == 1}
-    known |= {name: name for name in names}
+    known.update(zip(names, names, strict=True))
     named = {
         known.get(PureWindowsPath(entry).as_posix(), known.get(_stem(entry))): entry
         for entry in entries
@@ -218,15 +218,13 @@ class _Records:
         return self.data[start:end].decode("utf-8", "surrogateescape")
 
     def each(self) -> Iterator[int]:
-        """The numbers of the records that the file states; rejects bytes after the last."""
+        """The numbers of the records that the file states; rejects another end than the last's."""
         yield from range(*self.take("Q"))
-        if self.at < len(self.data):
-            raise ValueError(f"{len(self.data) - self.at} bytes after the records that it states")
+        if self.at != len(self.data):
+            raise ValueError(f"its last record ends at byte {self.at} of {len(self.data)}")
 
     def skip(self, size: int) -> None:
         self.at += size
-        if self.at > len(self.data):
-            raise ValueError(f"a record ends at byte {self.at} of {len(self.data)}")
 
 
 def _camera_records(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:

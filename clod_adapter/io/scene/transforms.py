@@ -96,7 +96,7 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
         viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
         images.append(check_posed(PosedImage(name, viewmat, camera, held_out), path))
     notes: list[str] = []
-    if held_out is None and any(content.get(key) is not None for key in LISTS):
+    if held_out is None:
         images, notes = _split(path, content, images)
     if any(leaves(frame["file_path"]) for frame in frames):
         notes.append(f"paths of {path.name} lead out of its folder: photographs are those in it")
@@ -119,6 +119,8 @@ def _split(
         if not isinstance(entries, list) or not all(isinstance(name, str) for name in entries):
             raise ClodError(f"{path}: {key} is no list of file names; correct or remove it")
         lists[key] = [with_ending(path.parent, name) or name for name in entries]
+    if not lists:
+        return images, []
     source = f"the lists of {path.name}"
     training = lists.pop(LISTS[0], None)
     if training is not None:
