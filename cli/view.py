@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clod_adapter._support.text import as_text, package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS, check_readable
 from clod_adapter.origin import Origin
@@ -122,7 +122,14 @@ def execute(args: Namespace) -> None:
 
 def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[str, Any]]:
     """What the server answers by path, and the report."""
-    from clod_adapter.viewer.page import Payload, camera_entry, document, page_config, policy
+    from clod_adapter.viewer.page import (
+        Payload,
+        camera_entry,
+        distinct_names,
+        document,
+        page_config,
+        policy,
+    )
     from clod_adapter.viewer.server import MOST_BYTES, Response
 
     from .shared.inputs import read_cameras, read_checkpoint, with_filter
@@ -157,9 +164,7 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
     payloads = {
         MODEL if k == 0 else f"/files/{k}": Payload.of(each) for k, each in enumerate(models)
     }
-    names = [payload.name for payload in payloads.values()]
-    if len({*names}) < len(names):  # with their folders, to tell them apart
-        names = [as_text("/".join(Path(each.path).absolute().parts[-2:])) for each in models]
+    names = distinct_names(models)
     entries = [{"name": name, "href": path} for name, path in zip(names, payloads, strict=True)]
     payloads |= {BASE: Payload.of(base)} if base else {}
     base_entry = {"name": payloads[BASE].name, "href": BASE} if base else None
@@ -221,7 +226,7 @@ Other machines cannot reach the page, and it loads nothing from the network. To
 see it from another machine, forward the port (-t passes Ctrl-C on):
   ssh -t -L 8000:127.0.0.1:8000 HOST \\
       clod-adapt view MODEL.ply --no-browser --port 8000
-"clod-adapt export MODEL.ply -o page.html" writes the page to a file.
+"clod-adapt export MODEL.ply ... -o page.html" writes the page to a file.
 --device-preset takes the cameras of --images, or those stored in MODEL.ply.
 --json prints its object at the start: {"url": ..., ...}.
 

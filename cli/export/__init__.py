@@ -36,6 +36,9 @@ def levels_of(text: str) -> list[float]:
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
+    given.add_argument(
+        "others", metavar="OTHER", nargs="*", help=f"more of them, to switch to in an {PAGE} page"
+    )
     about = "scene folder: cameras to bake for, and for the views of a page"
     common.add_reading(given, about, photographs=False)
     given.add_argument(
@@ -81,6 +84,14 @@ def check(args: Namespace) -> None:
     bakes = args.sv is not None or common.given_budget(args) is not None or bool(args.levels)
     page, folder, out = is_page(args), args.folder, Path(args.out)
     refuse(
+        (
+            args.others and not page,
+            f"{len(args.others) + 1} models are for an {PAGE} page; export one at a time",
+        ),
+        (
+            args.others and args.sh_degree is not None,
+            "--sh-degree is for one model; export each with it before the page",
+        ),
         (
             folder and bakes,
             (
@@ -130,7 +141,7 @@ def check(args: Namespace) -> None:
     )
     suffix = "" if folder else suffix_of(out)
     common.check_dials(args, args.model)
-    common.check_inputs(args.images, args.model)
+    common.check_inputs(args.images, args.model, *args.others)
     dial, form = file_has_dial(Path(args.model)), FORMATS.get(suffix)
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
     refuse(
@@ -173,7 +184,11 @@ def outputs(args: Namespace) -> Outputs:
     out, folder = Path(args.out), bool(args.folder)
     levels = level_paths(out, args.levels) if args.levels and not folder else []
     return Outputs(
-        [] if levels else [out], levels, whole=folder, inputs=[args.model], scene=args.images
+        [] if levels else [out],
+        levels,
+        whole=folder,
+        inputs=[args.model, *args.others],
+        scene=args.images,
     )
 
 
@@ -188,7 +203,7 @@ TABLE = "\n".join(
     f"  {suffix:<17}{'kept' if form.carries_sigma else '-':<6}" + f"\n{'':25}".join(form.about)
     for suffix, form in FORMATS.items()
 )
-USAGE = "MODEL -o OUT [--sv S | --keep N | ... | --levels S,...]"
+USAGE = "MODEL [OTHER ...] -o OUT [--sv S | --keep N | ... | --levels S,...]"
 EPILOG = f"""\
 formats, by the suffix of OUT:
   suffix           dial  values
@@ -221,9 +236,10 @@ SH degree:
 other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
   sh_degree in cfg_args next to the file.
-  .html is the page of "clod-adapt view" in one file; --sv or a budget sets its
-  initial dial value. .sog, .compressed.ply and --lod-meta need splat-transform
-  3.7 with Node 22, on the PATH or in CLOD_SPLAT_TRANSFORM.
+  .html is the page of "clod-adapt view" in one file, of one model or several;
+  --sv or a budget sets its initial dial value. .sog, .compressed.ply and
+  --lod-meta need splat-transform 3.7 with Node 22, on the PATH or in
+  CLOD_SPLAT_TRANSFORM.
 
 examples:
   clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply

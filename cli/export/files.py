@@ -8,6 +8,8 @@ from statistics import fmean
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import torch
+
 from clod_adapter.bake import Level, bake, bake_levels, order_by_extinction
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
@@ -16,11 +18,13 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.harmonics import with_sh_degree
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
+from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.file_formats import WRITABLE, write
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.io.settings import Metadata
 from clod_adapter.losses import psnr
+from clod_adapter.origin import Origin
 from clod_adapter.render import render
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page
@@ -70,6 +74,7 @@ def export(args: Namespace) -> dict[str, Any]:
         )
     return {
         "model": args.model,
+        "files": [args.model, *args.others],
         "base_count": total,
         "camera": camera.name if camera else None,
         "cameras": len(export.cameras),
@@ -105,8 +110,8 @@ class Export:
         self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
         times = args.images is not None and args.fps
         device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
-        read = inputs.read_checkpoint(args.model, self.console, args.activated, device=device)
-        self.model = inputs.with_filter(read, args, self.console)
+        self.model = self._read(args.model, device)
+        self.others = [self._read(path, device, self.model.origin) for path in args.others]
         # to bake or fit for, none where nothing is; in printable ASCII
         self.cameras, self.about = self._find_cameras()
         reads = self.page and args.images is not None  # cameras of the scene, for a page
@@ -127,6 +132,11 @@ class Export:
         elif dials:
             dials = choose_dials(dials, self.model, self.console)
         self.dials: list[float] = dials or []  # which are baked, or the one at which a page opens
+
+    def _read(self, path: str, device: torch.device, origin: Origin | None = None) -> Checkpoint:
+        activated = self.args.activated
+        read = inputs.read_checkpoint(path, self.console, activated, origin, device)
+        return inputs.with_filter(read, self.args, self.console)
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they
@@ -201,9 +211,10 @@ class Export:
 
     def note_losses(self) -> None:
         """Notes dropped columns, and a screen-space filter that most readers do not find."""
-        names = (self.model.vertex.dtype.names if self.model.vertex is not None else None) or ()
-        if dropped := extra_columns(names, self.gaussians.sh_degree):
-            self.console.note(f"columns dropped: {', '.join(dropped)}")
+        for model in (self.model, *self.others):
+            names = (model.vertex.dtype.names if model.vertex is not None else None) or ()
+            if dropped := extra_columns(names, model.gaussians.sh_degree):
+                self.console.note(f"columns dropped: {', '.join(dropped)}")
         screen_filter = self.gaussians.screen_filter
         has_dial = self.gaussians.sigma_d is not None and not self.dials
         stored = not self.args.folder and suffix_of(Path(self.args.out)) in STORE_FILTER
@@ -267,7 +278,7 @@ class Export:
         """Writes a file, with notes on losses of the format; its number of Gaussians."""
         if suffix == PAGE:
             self._write_page(path, virtual_scale)
-            return self.gaussians.whole
+            return sum(model.gaussians.whole for model in (self.model, *self.others))
         gaussians, about = self._content(virtual_scale)
         if suffix not in WRITABLE:
             with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
@@ -307,6 +318,7 @@ class Export:
         """Notes the PSNR of its renders against those of the exact Gaussians."""
         inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
         how: dict[str, Any] = {
+            "others": self.others,
             "cameras": self.views,
             "virtual_scale": virtual_scale,
             "exact": self.args.exact,
@@ -319,7 +331,8 @@ class Export:
             agreement = self._agreement(shown, self.gaussians)
         self.console.note(
             f"renders of the page have a PSNR of {agreement:.1f} dB against the exact file (s = 1);"
-            " --exact keeps all digits"
+            " --exact keeps all digits",
+            of=str(self.model.path),
         )
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.resources import files
 from io import BytesIO
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -127,12 +127,15 @@ class Payload:
             rows = torch.cat([values.flatten(1) for values in columns_of_block], 1).detach()
             yield rows.float().cpu().numpy().astype("<f4", copy=False).tobytes()
 
-    def packed(self, file: str) -> tuple[bytes, Gaussians, tuple[str, ...]]:
-        """The splat as SPZ, of which rows that are near one another take a tenth less.
+    def content(self, file: str, exact: bool) -> tuple[bytes, Gaussians, tuple[str, ...]]:
+        """The splat as PLY, if ``exact``, or as SPZ, of which rows that are near one another take a
+        tenth less.
 
         ``file`` is a temporary name. Returns the bytes, the Gaussians in them, and a line for each
         loss.
         """
+        if exact:
+            return b"".join(self.blocks()), self.gaussians, ()
         rows = _along_curve(self.gaussians.means)
         try:
             metadata = Metadata(calibration=self.calibration, origin=self.origin, about=self.about)
@@ -202,41 +205,53 @@ def page_config(
     }
 
 
+def distinct_names(models: Sequence[Checkpoint]) -> list[str]:
+    """The names of the models' files, with their folders where two are alike."""
+    names = [as_text(model.path.name) for model in models]
+    if len({*names}) < len(names):
+        names = [as_text("/".join(model.path.absolute().parts[-2:])) for model in models]
+    return names
+
+
 def write_viewer_page(
     path: str | Path,
     model: Checkpoint,
     *,
+    others: Sequence[Checkpoint] = (),
     cameras: Sequence[Camera] = (),
     virtual_scale: float | None = None,
     exact: bool = False,
 ) -> tuple[Gaussians, tuple[str, ...]]:
     """Writes the page as one file with the splats in it; the same arguments give the same bytes.
 
-    ``virtual_scale`` is as in ``page_config``; ``exact`` includes float32, not SPZ. Returns the
-    Gaussians as the page shows them, and a line for each loss.
+    ``others`` are models to switch to, with the origin of ``model``. ``virtual_scale`` is as in
+    ``page_config``; ``exact`` includes float32, not SPZ. Returns the Gaussians of ``model`` as the
+    page shows them, and a line for each loss.
     """
-    payload = Payload.of(model)
+    models = [model, *others]
+    payloads = [Payload.of(each) for each in models]
     placed = model.placed and not cameras
     cameras = cameras or model.cameras
     entries = [camera_entry(camera, placed) for camera in cameras]
-    entry = {"name": payload.name, "element": ELEMENT}
-    config = page_config([entry], None, entries, virtual_scale)
+    elements = [ELEMENT, *(f"{ELEMENT}-{k}" for k in range(1, len(models)))]
+    names = distinct_names(models)
+    files = [
+        {"name": name, "element": element} for name, element in zip(names, elements, strict=True)
+    ]
+    config = page_config(files, None, entries, virtual_scale)
     with atomic_path(path) as temporary:
-        if exact:
-            data = b"".join(payload.blocks())
-            gaussians = payload.gaussians
-            notes = tuple[str, ...]()
-        else:
-            data, gaussians, notes = payload.packed(f"{temporary}.spz")
+        contents = [payload.content(f"{temporary}.spz", exact) for payload in payloads]
+        data, shown, losses = zip(*contents, strict=True)
+        gaussians = shown[0]
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
         first = cameras[0] if cameras else None
         if first and placed:
-            first = levelled(first, up_axis(gaussians, payload.about))
+            first = levelled(first, up_axis(gaussians, payloads[0].about))
         poster = _poster(gaussians, first, opening) if first else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
         with open(temporary, "wb") as file:
-            file.writelines(document(config, _elements(data), meta, poster))
-    return gaussians, notes
+            file.writelines(document(config, _elements(elements, data), meta, poster))
+    return gaussians, tuple(dict.fromkeys(chain(*losses)))
 
 
 def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
@@ -335,14 +350,17 @@ def document(
             yield (content[piece] if number % 2 else piece).encode()
 
 
-def _elements(data: bytes) -> Iterator[bytes]:
+def _elements(elements: Sequence[str], data: Sequence[bytes]) -> Iterator[bytes]:
     """Script elements with the bytes as base64; large data are divided among several with the same
     id.
     """
-    element = ELEMENT.encode()
-    for start in range(0, len(data), PART):
-        encoded = base64.b64encode(data[start : start + PART])
-        yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (element, encoded)
+    for element, content in zip(elements, data, strict=True):
+        for start in range(0, len(content), PART):
+            encoded = base64.b64encode(content[start : start + PART])
+            yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (
+                element.encode(),
+                encoded,
+            )
 
 
 @cache

@@ -178,6 +178,8 @@ ERRORS = [
     ),
     ("export bare.ply -o lod-meta.json --lod-meta", "--out names the folder for lod-meta.json"),
     ("export bare.ply -o . --lod-meta", ".: is the current folder; --out must name a new one"),
+    ("export bare.ply base.ply -o x.ply", "2 models are for an .html page; export one at a time"),
+    ("export bare.ply base.ply -o x.html --sh-degree 1", "--sh-degree is for one model"),
     ("export bare.ply -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
     (
         "export bare.ply -o x.ply --images scene",

@@ -328,3 +328,21 @@ def test_page_holds_the_splat_and_its_dial(clod, dialled, tmp_path):
     assert said and float(said[1]) > 40 and [*tmp_path.glob(".tmp-*")] == []
     done, _, held = page("--exact", name="held.ply")
     assert "PSNR" not in done.err and held.gaussians == load(dialled).gaussians
+
+
+def test_a_page_of_several_models(clod, dialled, tmp_path):
+    """Of the same name in two folders; each has its own data."""
+    other = tmp_path / "other" / dialled.name
+    other.parent.mkdir()
+    save(other, load(dialled).gaussians[:100])
+    done = clod("export DIAL", other, "--exact --json -o page.html")
+    assert done.report["files"] == [str(dialled), str(other)] and done.output["count"] == 400
+    text = (tmp_path / "page.html").read_text("utf-8")
+    (config,) = re.findall(r'id="clod-config">(.*?)</script>', text)
+    entries = [json.loads(config)["model"], *json.loads(config)["others"]]
+    names = [f"{path.parent.name}/{path.name}" for path in (dialled, other)]
+    assert [entry["name"] for entry in entries] == names
+    for entry, path in zip(entries, (dialled, other), strict=True):
+        (data,) = re.findall(f'id="{entry["element"]}">(.*?)</script>', text)
+        Path("held.ply").write_bytes(base64.b64decode(data))
+        assert load("held.ply").gaussians == load(path).gaussians

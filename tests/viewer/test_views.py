@@ -185,6 +185,27 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     assert opened.page.title() == "b.glb" and not differ(opened.picture(), of_second)
 
 
+def test_a_page_of_two_files(show, gaussians, tmp_path):
+    """Switched there and back, and back from a dropped file, though the page frees its data."""
+    for name, model in {"a.ply": gaussians, "b.ply": gaussians[:200]}.items():
+        write(tmp_path / name, model)
+    first, second = (clod_adapter.load(tmp_path / name) for name in ("a.ply", "b.ply"))
+    out = tmp_path / "page.html"
+    write_viewer_page(out, first, others=[second], cameras=ring(1, 320, 240), virtual_scale=2.0)
+    shown = show(url=out.as_uri(), viewport=TALL)
+    assert shown.page.locator("#files option").all_inner_texts() == ["a.ply", "b.ply"]
+    picture = shown.picture()
+    for key, name, total in (("2", "b.ply", 200), ("1", "a.ply", 400), ("2", "b.ply", 200)):
+        shown.press(key)
+        shown.until(f"document.title === '{name}'")
+        assert shown.counts()["total"] == total and shown.dial == "s = 2.00"
+        assert differ(shown.picture(), picture) == (name == "b.ply")
+    drop(shown, "dropped.ply", (tmp_path / "a.ply").read_bytes())
+    shown.until("document.title === 'dropped.ply'")
+    shown.press("1")
+    shown.until("document.title === 'a.ply'")
+
+
 def test_another_scene_opens_in_its_own_view(show, gaussians, tmp_path):
     """A level of the same scene in the view that is there."""
     other = gaussians.replace(

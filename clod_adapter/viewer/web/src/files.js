@@ -10,9 +10,11 @@ const OPENING = 30; // frames per second that are held when a file opens
 
 const fetchModel = async ({ name, href, element }) => readFile(href ? await download(href) : included(element), name);
 
+const blobs = {}; // by id
+
 /** The bytes that the elements with this id have in base64; removes these elements, for their memory. */
 function included(id) {
-  return new Blob([...document.querySelectorAll(`[id="${id}"]`)].map((element) => {
+  return blobs[id] ??= new Blob([...document.querySelectorAll(`[id="${id}"]`)].map((element) => {
     const characters = atob(element.textContent.trim()), bytes = new Uint8Array(characters.length);
     element.remove();
     for (let i = 0; i < bytes.length; i++) bytes[i] = characters.charCodeAt(i);
