@@ -203,7 +203,7 @@ TABLE = "\n".join(
     f"  {suffix:<17}{'kept' if form.carries_sigma else '-':<6}" + f"\n{'':25}".join(form.about)
     for suffix, form in FORMATS.items()
 )
-USAGE = "MODEL [OTHER ...] -o OUT [--sv S | --keep N | ... | --levels S,...]"
+USAGE = "MODEL [OTHER ...] -o OUT [--sv S | --keep N | ...]"
 EPILOG = f"""\
 formats, by the suffix of OUT:
   suffix           dial  values
