@@ -25,7 +25,7 @@ OF_OPACITY = "2; float64: + 1 / (1 - t)"
 BOUNDS = {
     "drawn opacity": OF_OPACITY,
     "its gradient by logit, relative to it": OF_OPACITY,
-    "its gradient by sigma_d": "10",
+    "its gradient by sigma_d": "6",
     "growth": "4 + 2 abs(h) (1 + log m)",
     "its gradient by growth_d": "4 + 2 abs(h) (1 + log m) + 2 / log m",
 }
@@ -107,12 +107,12 @@ def check_opacities(tally, random, s):
             continue  # both answers are right
         a = 1 / (1 + mpmath.exp(-mpf(logit)))
         allowed = 2 + EXACT / tally.info.eps / max(float(1 - t), EXACT)
-        want = a * (1 - t**8) if t < 1 else mpf(0)
+        want = a * (1 - t**4) if t < 1 else mpf(0)
         slope = want * (1 - a)
         tally.add("drawn opacity", opacity, want, allowed)
         tally.add("its gradient by logit, relative to it", by_logit, slope, allowed, scale=want)
-        slope = 8 * a * t**8 / mpf(reach) if t < 1 else mpf(0)
-        tally.add("its gradient by sigma_d", by_sigma, slope, 10)
+        slope = 4 * a * t**4 / mpf(reach) if t < 1 else mpf(0)
+        tally.add("its gradient by sigma_d", by_sigma, slope, 6)
 
 
 def check_growth(tally, random, s):

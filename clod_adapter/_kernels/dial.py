@@ -84,13 +84,6 @@ def squared_share(sigma, far2):
 
 
 @inlined
-def eighth_power(square):
-    """``t^8`` of ``t^2``."""
-    fourth = square * square
-    return fourth * fourth
-
-
-@inlined
 def reciprocal_opacity(logit):
     """``1 / sigmoid(logit)``."""
     return 1 + exp2(vmin(-logit * LOG2E, FARTHEST_EXPONENT))
@@ -155,7 +148,8 @@ def drawn(rows, stored, drawing, w):
         distance2 = squared_distance(w, drawing.cam)
         reach = gather(stored.sigma, rows)
         far2 = distance2 * dial[RATE2]
-        fade = 1 - eighth_power(squared_share(reach, far2))
+        share2 = squared_share(reach, far2)
+        fade = 1 - share2 * share2
         if dial[NEAR2] > 0:
             takeover_share = vmin(1, vmax(0, takeover(far2, dial[NEAR2])))
             fade = select(gt(reach, 0), fade * takeover_share, 1 - takeover_share)
@@ -184,7 +178,7 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
     Gaussian::
 
         dL/dlogit    = w sigmoid(-logit)
-        dL/dsigma    = w 8 t^8 / ((1 - t^8) sigma)      distances are constants
+        dL/dsigma    = w 4 t^4 / ((1 - t^4) sigma)      distances are constants
         dL/dlogscale = dL/dscale scale
         dL/dgrowth   = sum of dL/dlogscale, times log m         0 where the growth is clamped
 
@@ -203,9 +197,10 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
     if drawing.fades:
         reach = gather(stored.sigma, rows)
         distance2 = squared_distance(w, drawing.cam)
-        share8 = eighth_power(squared_share(reach, distance2 * dial[RATE2]))
-        fading = both(gt(share8, 0), gt(1, share8))
-        slope = 8 * share8 / ((1 - share8) * reach)
+        share2 = squared_share(reach, distance2 * dial[RATE2])
+        share4 = share2 * share2
+        fading = both(gt(share4, 0), gt(1, share4))
+        slope = 4 * share4 / ((1 - share4) * reach)
         scatter(gradients.sigma, rows, select(fading, total * slope, 0))
         if drawing.grows and shaped:
             magnification = log2_magnification(distance2, dial)

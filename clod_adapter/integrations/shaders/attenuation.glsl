@@ -6,8 +6,8 @@
 float clodOpacity(float opacity, float sigma, float distance, float scale, float near) {
   float far = distance * scale, x = near > 0.0 ? min(far / near, 1.0) : 1.0, taken = max(12.0 * x * x - 11.0, 0.0);
   if (near > 0.0 && sigma <= 0.0) return opacity * (1.0 - taken);
-  float t = far < sigma ? far / sigma : 1.0, t4 = t * t * t * t;
-  return far > 0.0 ? opacity * taken * max(1.0 - t4 * t4, 0.0) : opacity * taken;
+  float t = far < sigma ? far / sigma : 1.0;
+  return far > 0.0 ? opacity * taken * max(1.0 - t * t * t * t, 0.0) : opacity * taken;
 }
 
 // The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.

@@ -6,8 +6,7 @@ float clodOpacity(float opacity, float sigma, float seenFrom, float scale, float
   float taken = max(12.0 * x * x - 11.0, 0.0);
   if (nearDistance > 0.0 && sigma <= 0.0) return opacity * (1.0 - taken);
   float t = reached < sigma ? reached / sigma : 1.0;
-  float t4 = t * t * t * t;
-  return reached > 0.0 ? opacity * taken * max(1.0 - t4 * t4, 0.0) : opacity * taken;
+  return reached > 0.0 ? opacity * taken * max(1.0 - t * t * t * t, 0.0) : opacity * taken;
 }
 
 // The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.

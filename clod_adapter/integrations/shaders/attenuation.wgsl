@@ -6,8 +6,7 @@ fn clodOpacity(opacity: f32, sigma: f32, distance: f32, scale: f32, near: f32) -
   let taken = max(12.0 * x * x - 11.0, 0.0);
   if (near > 0.0 && sigma <= 0.0) { return opacity * (1.0 - taken); }
   let t = select(1.0, far / sigma, far < sigma);
-  let t4 = t * t * t * t;
-  return opacity * taken * select(1.0, max(1.0 - t4 * t4, 0.0), far > 0.0);
+  return opacity * taken * select(1.0, max(1.0 - t * t * t * t, 0.0), far > 0.0);
 }
 
 // The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.
