@@ -152,6 +152,31 @@ def test_other_models_are_found_and_noted(tmp_path):
     assert load_scene(tmp_path).notes == ()
 
 
+@pytest.mark.parametrize(
+    ("model", "photographs"),
+    [
+        ("colmap/0", "images"),
+        ("dense/sparse", "dense/images"),
+        ("dense/sparse/0", "dense/images"),
+        ("distorted/sparse/0", "input"),
+    ],
+)
+def test_models_and_their_own_photographs(tmp_path, model, photographs):
+    """Not those of the same names beside them, of which there are more here."""
+    names = write_scene(tmp_path, 3)[1]
+    (tmp_path / model).parent.mkdir(parents=True)
+    (tmp_path / "sparse" / "0").rename(tmp_path / model)
+    if photographs != "images":
+        shutil.copytree(tmp_path / "images", tmp_path / photographs)
+        for name in names:
+            Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
+        (tmp_path / photographs / names[0]).unlink()
+    loaded = load_scene(tmp_path)
+    assert all(view.image.any() for view in (*loaded.train, *loaded.test))
+    notes = ("1 of 3 photographs are missing and left out (sub/003.png)",)
+    assert loaded.notes == (notes if photographs != "images" else ())
+
+
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
 def test_another_number_of_records_than_stated_is_refused(tmp_path, file):
     path = model_of(tmp_path, **PINHOLES) / f"{file}.bin"

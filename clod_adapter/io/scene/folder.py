@@ -30,6 +30,8 @@ MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 SMALLER = ("images_2", "images_4", "images_8")
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
 NAMES = ("images", *SMALLER, RAW)  # of folders of photographs, the likeliest first
+# of the photographs of models in these folders: COLMAP's undistorted ones, and Inria's distorted
+OWN = {"dense": "dense/images", "distorted": RAW}
 MASKS = "*[Mm][Aa][Ss][Kk]*"  # folders of masks
 # what is said of masks
 UNUSED = (
@@ -46,14 +48,17 @@ def find_cameras(folder: Path) -> Path:
     """The folder of a COLMAP model, or the transforms file of a scene.
 
     Looked for in this order: a model in sparse/0, sparse/1, ..., sparse and ``folder``; TRANSFORMS
-    there; nerfstudio's colmap/sparse/0; and a model in sparse beside ``folder``, which may be the
-    images' own.
+    there; nerfstudio's colmap/sparse/0, and colmap/0; COLMAP's dense/sparse; Inria's
+    distorted/sparse/0; and a model in sparse beside ``folder``, which may be the images' own.
     """
     candidates = [
         *models_in(folder / "sparse"),
         *models_in(folder),
         *(folder / name for name in TRANSFORMS if (folder / name).is_file()),
         *models_in(folder / "colmap" / "sparse"),
+        *models_in(folder / "colmap"),
+        *models_in(folder / "dense" / "sparse"),
+        *models_in(folder / "distorted" / "sparse"),
         *models_in(folder.resolve().parent / "sparse"),
     ]
     if not candidates:
@@ -91,23 +96,30 @@ def photograph_folders(folder: Path, cameras: Path) -> list[Path]:
     return [first, folder, *others]
 
 
+def _roots(folder: Path, cameras: Path, raw: bool) -> list[Path]:
+    """The folder of OWN alone, if it is there: photographs of the same names elsewhere are of other
+    cameras. Else ``photograph_folders``, with ``input`` only if ``raw``: where the cameras are
+    pinholes, Inria's code made them together with other photographs.
+    """
+    for parent, photographs in OWN.items():
+        if folder / parent in cameras.parents and (folder / photographs).is_dir():
+            return [folder / photographs]
+    roots = photograph_folders(folder, cameras)
+    return [root for root in roots if raw or root.name != RAW or root == folder]
+
+
 def find_photographs(
     folder: Path, cameras: Path, names: Sequence[str], *, raw: bool
 ) -> tuple[list[Path | None], list[str]]:
     """The files of these names, None for those that are missing, and notes.
 
-    All are from the one of ``photograph_folders`` that has most of them; ``input`` is one of these
-    only with ``raw``: where the cameras are pinholes, Inria's code made them together with other
-    photographs.
+    All are from the one of ``_roots`` that has most of them.
     """
     split_names = [name_parts(name, cameras) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
-    candidates = [
-        (*find_files(root, split_names), root)
-        for root in photograph_folders(folder, cameras)
-        if raw or root.name != RAW or root == folder
-    ]
+    roots = _roots(folder, cameras, raw)
+    candidates = [(*find_files(root, split_names), root) for root in roots]
     paths, others, root = min(candidates, key=lambda files: (files[0].count(None), len(files[1])))
     notes = []
     if others:
@@ -116,7 +128,7 @@ def find_photographs(
             f"{len(others)} of {len(names)} photographs have another suffix or case, such as"
             f" {example}"
         )
-    if root.name in (*SMALLER, RAW) and root != folder:
+    if root.name in (*SMALLER, RAW) and root != folder and len(roots) > 1:
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
     if cameras.is_dir():
         beside = root.parent if root.name in NAMES else root
