@@ -205,6 +205,22 @@ def test_logarithms_by_the_generator_of_a_glb(tmp_path):
     assert_close(load(path).gaussians.log_scales, g.scales)
 
 
+@pytest.mark.parametrize(("size", "sizes"), [(1e4, 6.0), (1.0, 0.1), (100.0, 40.0)])
+def test_scales_of_a_glb_that_may_be_logarithms(tmp_path, size, sizes):
+    """Those of a scene in large units are noted, unless the generator is known; small ones, and
+    such as would be larger than the scene, are linear.
+    """
+    path, g = tmp_path / "a.glb", detach(gaussians(30, 0, 0))
+    scales = torch.linspace(0.01, sizes, 90).view(30, 3)
+    write(path, g.replace(means=size * g.means, log_scales=scales.log()))
+    assert load(path).notes == ()
+    for generator, noted in (("other 1.0", size == 1e4), ("splat-transform 2.7.1", False)):
+        change_glb(path, lambda gltf, name=generator: gltf["asset"].update(generator=name))
+        found = load(path)
+        assert any("may be logarithms" in note for note in found.notes) == noted
+        assert_close(found.gaussians.scales, scales)
+
+
 def spz(path):
     return bytearray(gzip.decompress(path.read_bytes()))
 

@@ -68,6 +68,7 @@ IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 # a program that wrote SCALE so, whatever its range
 _LOGARITHMS = r"splat-transform 2\.([0-2]\.\d+|3\.[01])"
+_LINEAR = ("clod-adapter ", "splat-transform ")  # of which all others write SCALE as glTF has it
 _STRAY = 0.01  # the largest share of values beyond the extension's range that are only damaged
 
 
@@ -365,6 +366,11 @@ def _stored(
     if re.fullmatch(_LOGARITHMS, generator) or _beyond(scales, np.inf):
         notes.append("its SCALE is not linear, as glTF has it, and is read as logarithms")
     else:
+        if not generator.startswith(_LINEAR) and _may_be_logarithms(scales, arrays["means"]):
+            notes.append(
+                "its SCALE is read as linear, as glTF has it, but may be logarithms: if its"
+                f" Gaussians look too small, {_REMEDY}"
+            )
         scales = values.logs_of(scales)
     if _beyond(opacities, 1):
         notes.append("its OPACITY is not within 0 and 1, as glTF has it, and is read as logits")
@@ -372,6 +378,18 @@ def _stored(
         opacities = np.maximum(values.logit(np.clip(opacities, 0, 1)), _FAINTEST)
     stored = {"log_scales": scales, "opacity_logits": opacities, "sh0": arrays["sh0"][:, None]}
     return {**arrays, **stored, "quats": np.roll(arrays["quats"], 1, axis=1)}, notes
+
+
+def _may_be_logarithms(scales: np.ndarray, means: np.ndarray) -> bool:
+    """Whether positive scales would, as logarithms, be of unequal sizes within the scene; those of
+    most linear ones are equal, or far larger.
+    """
+    finite = np.isfinite(scales).all(1) & np.isfinite(means).all(1)
+    if not finite.any():
+        return False
+    low, high = np.quantile(scales[finite], (0.05, 0.95))
+    extent = np.ptp(means[finite].astype(np.float64), axis=0).max()
+    return bool(high - low > 1 and high < np.log(max(extent, 1.0)))
 
 
 def _beyond(numbers: np.ndarray, most: float) -> bool:
