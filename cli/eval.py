@@ -161,7 +161,7 @@ class Comparisons:
 
         with self.console.meter("removal error") as meter:
             views = spread(self.scene.train, MOST_VIEWS)
-            removal = removal_error(base, views, progress=self.stop.heeding(meter))
+            removal = removal_error(base, views, progress=self.stop.stop_on_signal(meter))
         values = {"opacity": base.opacity_logits, "removal error": removal}
         orders = {by: each.argsort(descending=True, stable=True) for by, each in values.items()}
         jobs = list(product(rows, orders))
@@ -235,7 +235,7 @@ class Comparisons:
             jobs.append((f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}", path))
         with self.console.meter("popping") as meter:
             for i, (moved, sweep) in enumerate(jobs):
-                popping = sweep(progress=self.stop.heeding(meter.part(i, len(jobs), moved)))
+                popping = sweep(progress=self.stop.stop_on_signal(meter.part(i, len(jobs), moved)))
                 self.popping.append((moved, popping))
                 self.report["popping"].append({"moved": moved, **vars(popping)})
 
@@ -243,7 +243,7 @@ class Comparisons:
         from clod_adapter.evaluation.evaluate import evaluate
 
         rows = evaluate(
-            gaussians, self.scene.test, [virtual_scale], progress=self.stop.heeding(listener)
+            gaussians, self.scene.test, [virtual_scale], progress=self.stop.stop_on_signal(listener)
         )
         if not rows:
             raise Stopped("stopped within a comparison")

@@ -127,13 +127,13 @@ def run_here(name: str, args: argparse.Namespace) -> int:
         return run(name, args)
     if name:
         raise ClodError("only adapting takes several processes; run this command without torchrun")
-    from .adapt.processes import leading, take_part
+    from .adapt.processes import rank0_session, run_worker
 
     if launch.rank > 0:
         with process.signals_as_interrupt():
-            take_part()
+            run_worker()
         return 0
-    with leading():
+    with rank0_session():
         return run(name, args)
 
 

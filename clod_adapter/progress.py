@@ -139,7 +139,7 @@ class GracefulStop:
         """Whether the user does not want anything to be written."""
         return self.aborts and self.presses > 1
 
-    def heeding(self, display: Listener | None = None) -> Listener:
+    def stop_on_signal(self, display: Listener | None = None) -> Listener:
         """The listener that calls ``display`` and stops once a signal has arrived."""
         return lambda now: (display is None or display(now) is not False) and self.requests == 0
 

@@ -114,9 +114,9 @@ def captured():
 
 
 @pytest.fixture(scope="session")
-def dialled(capture, tmp_path_factory):
+def attenuated(capture, tmp_path_factory):
     """The capture's checkpoint with a dial up to 4 and its calibration, as clod-adapt writes it."""
-    path = tmp_path_factory.mktemp("dialled") / "dial.ply"
+    path = tmp_path_factory.mktemp("attenuated") / "dial.ply"
     words = f"{capture.ply} --images {capture.scene} --iters 12 --max-sv 4 --out {path} --quiet"
     assert main(accepted(words.split())) == 0
     return path

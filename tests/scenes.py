@@ -68,7 +68,7 @@ def splatfacto_parameters(g):
     return named | {"opacities": named["opacities"][:, None]}
 
 
-def dialled(n, degree, seed, **settings):
+def attenuated(n, degree, seed, **settings):
     """Gaussians with a sigma_d log-normal around e, and 0 in every 50th row."""
     sigma_d = (torch.randn(n, generator=seeded(seed + 1)) + 1).exp()
     sigma_d[::50] = 0.0

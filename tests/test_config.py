@@ -93,11 +93,11 @@ def test_round_trips(tmp_path):
         viewpoints=[Viewpoint(1 / 3, -1e6, 5e-324, 1e-9)],
     )
     base = gaussians(4, 0, 0)
-    dialled = with_dial(base, torch.ones(4))
-    save(tmp_path / "a.ply", dialled, calibration=calibration)
+    attenuated = with_dial(base, torch.ones(4))
+    save(tmp_path / "a.ply", attenuated, calibration=calibration)
     assert load(tmp_path / "a.ply").calibration == calibration
     assert load(tmp_path / "a.ply").notes == ()
-    adapter = replace(extract(base, dialled, fingerprint="", config={}), calibration=calibration)
+    adapter = replace(extract(base, attenuated, fingerprint="", config={}), calibration=calibration)
     save_adapter(tmp_path / "a.safetensors", adapter)
     assert load_adapter(tmp_path / "a.safetensors").calibration == calibration
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0]
@@ -147,12 +147,12 @@ def test_bad_values_are_refused(good, bad, said):
 def test_stored_viewpoints_are_cameras_again(tmp_path):
     path = tmp_path / "a.ply"
     cameras = ring(3, 40, 30)
-    dialled = with_dial(gaussians(4, 0, 0), torch.ones(4))
+    attenuated = with_dial(gaussians(4, 0, 0), torch.ones(4))
     points = torch.randn(50, 3)
     viewpoints = tuple(viewpoint_of(camera, points, AttenuationConfig()) for camera in cameras)
     # one without a direction is no camera
     for places, count in ((viewpoints, 3), ((Viewpoint(1.5, 2.5, 3.5, 4.5),), 0)):
-        save(path, dialled, calibration=Calibration(**GOOD, viewpoints=places))
+        save(path, attenuated, calibration=Calibration(**GOOD, viewpoints=places))
         stored = load(path)
         assert stored.viewpoints == places and len(stored.cameras) == count
         for camera, again in zip(cameras, stored.cameras, strict=False):

@@ -85,8 +85,8 @@ def baked(**given):
 
 def hook(model):
     own = model.cpu()  # the hook follows the means
-    dialled = Hook(own.sigma_d, own.attenuation, DIAL, own.growth_d)
-    return list(dialled(model.means, model.opacities, CAMERAS[0].viewmat))
+    attenuated = Hook(own.sigma_d, own.attenuation, DIAL, own.growth_d)
+    return list(attenuated(model.means, model.opacities, CAMERAS[0].viewmat))
 
 
 def popping(model):
@@ -171,11 +171,13 @@ def own_loop(model):
     splats = torch.nn.ParameterDict(
         {n: torch.nn.Parameter(x.clone()) for n, x in to_gsplat(detach(model)).items()}
     )
-    dialled = attach(from_gsplat(splats), CAMERAS, CONFIG)
-    groups = dialled.param_groups(splats=True)
-    loss = dialled.loss(DIAL, render(dialled.gaussians(), CAMERAS[0], DIAL).image.square().mean())
+    attenuated = attach(from_gsplat(splats), CAMERAS, CONFIG)
+    groups = attenuated.param_groups(splats=True)
+    loss = attenuated.loss(
+        DIAL, render(attenuated.gaussians(), CAMERAS[0], DIAL).image.square().mean()
+    )
     loss.backward()
-    assert len(groups) == 8 and dialled(CAMERAS[0], DIAL).drawn.device == model.means.device
+    assert len(groups) == 8 and attenuated(CAMERAS[0], DIAL).drawn.device == model.means.device
     return [loss.detach(), *(group["params"][0].grad for group in groups)]
 
 

@@ -80,8 +80,8 @@ def test_training_and_rendering(run, capture, monkeypatch):
     assert "of 300 Gaussians" in run(2, "dial.ply", capture.scene)  # without held-out views
 
 
-def test_budgets(run, dialled, capture):
-    printed = run(5, dialled, capture.scene).splitlines()
+def test_budgets(run, attenuated, capture):
+    printed = run(5, attenuated, capture.scene).splitlines()
     names = "50% of,25% of,10% of,0.1 dB,0.5 dB,1 dB,10 frames,30 frames,60 frames"
     for line, name in zip(printed, names.split(","), strict=True):
         assert line.startswith(name)
@@ -93,14 +93,14 @@ def test_budgets(run, dialled, capture):
     assert "(beyond s = 4, " in printed[2]
 
 
-def test_adapter_is_applied_and_removed(run, dialled, capture, tmp_path):
-    printed = run(6, capture.ply, dialled.with_suffix(".safetensors"), "again.ply")
+def test_adapter_is_applied_and_removed(run, attenuated, capture, tmp_path):
+    printed = run(6, capture.ply, attenuated.with_suffix(".safetensors"), "again.ply")
     assert "changed: sigma_d, far Gaussians" in printed and f"{capture.ply}, bit for bit" in printed
-    assert (tmp_path / "again.ply").read_bytes() == dialled.read_bytes()
+    assert (tmp_path / "again.ply").read_bytes() == attenuated.read_bytes()
     brighter = capture.gaussians.replace(sh0=capture.gaussians.sh0 + 1)
     other = capture.write(tmp_path / "other.ply", brighter)
     with pytest.raises(SystemExit, match="a different base was given"):
-        run(6, other, dialled.with_suffix(".safetensors"), "other_again.ply")
+        run(6, other, attenuated.with_suffix(".safetensors"), "other_again.ply")
     assert not (tmp_path / "other_again.ply").exists()
 
 

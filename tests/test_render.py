@@ -23,7 +23,7 @@ from clod_adapter.equation.attenuation import attenuate, dial
 from clod_adapter.equation.distances import normalized_distances, viewpoint_of
 from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import splat
-from scenes import camera, dialled, gaussians, ring, seeded
+from scenes import attenuated, camera, gaussians, ring, seeded
 
 CONFIG = AttenuationConfig(scene_distance=3.0)
 
@@ -56,7 +56,7 @@ def test_rendering_no_gaussians():
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_dial_of_0_shows_the_file_without_its_dial(form):
-    own = dialled(400, 1, 3, form=form).replace(growth_d=torch.linspace(0, 1, 400))
+    own = attenuated(400, 1, 3, form=form).replace(growth_d=torch.linspace(0, 1, 400))
     view = camera()
     found = render(own, view, 0.0).image
     want = render(detach(own), view).image

@@ -12,7 +12,7 @@ from clod_adapter._support.text import package_version
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import GracefulStop, Listener, Progress, Stopped
-from clod_adapter.training.state import StateRefused, TrainingState, load_state, save_state
+from clod_adapter.training.state import StateRejected, TrainingState, load_state, save_state
 
 from ..shared.command import SETTINGS, as_option
 from ..shared.console import Console
@@ -140,7 +140,7 @@ class Saver:
             yield
         except Stopped:
             raise
-        except StateRefused as error:
+        except StateRejected as error:
             raise ClodError(
                 f"{self.path}: {str(error).partition(';')[0]}; delete it to start over"
             ) from error

@@ -56,7 +56,7 @@ class Job(NamedTuple):
 
 
 @contextmanager
-def leading() -> Iterator[None]:
+def rank0_session() -> Iterator[None]:
     """Within the block the first process may give the others a job; after it they end."""
     store = _store()
     _use_threads(1)
@@ -68,7 +68,7 @@ def leading() -> Iterator[None]:
 
 
 @contextmanager
-def together(
+def training_group(
     plan: Plan, scene: Scene, state: TrainingState | None, display: ProgressDisplay
 ) -> Iterator[ProcessGroup | None]:
     """The group to train with, after giving the others the job of ``plan.adapt``; None for a single
@@ -104,7 +104,7 @@ def together(
         _use_threads(1)  # the others are done
 
 
-def take_part() -> None:
+def run_worker() -> None:
     """Trains silently, if there is a job, in a process that is not the first."""
     launch, stop = launched(), GracefulStop(aborts=False)
     _use_threads(launch.local_size)
@@ -135,7 +135,7 @@ def _train(group: ProcessGroup, launch: Launch, stop: GracefulStop) -> None:
         torch.cuda.set_device(launch.local_rank)
     scene = Scene(teachers_to(job.views, job.device), ())
     start = job.start.to(job.device)
-    adapt(start, scene, job.config, stop.heeding(), job.state, group=group)
+    adapt(start, scene, job.config, stop.stop_on_signal(), job.state, group=group)
 
 
 def explain(lost: str) -> str:
@@ -147,7 +147,7 @@ def explain(lost: str) -> str:
     return "; ".join([lost, *said])
 
 
-def hurried(adapted: Adapted) -> bool:
+def must_exit_soon(adapted: Adapted) -> bool:
     """Whether the launcher ends the processes: after its signal, or a lost process, it waits for 30
     seconds.
     """

@@ -23,9 +23,9 @@ from ..shared.console import ProgressDisplay, duration
 from ..shared.measure import by_dial, comparable, measure, table
 from ..shared.outputs import size, write_report
 from ..shared.pages import AdaptPage
-from ..shared.process import launched, listen_no_more
+from ..shared.process import ignore_signals, launched
 from .prepare import Run, against_forecast, decide, forecast
-from .processes import BACKENDS, explain, hurried, together
+from .processes import BACKENDS, explain, must_exit_soon, training_group
 
 # dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is
 # told and what fails.
@@ -60,7 +60,7 @@ def train(run: Run, page: AdaptPage | None) -> tuple[Plan, Adapted]:
             page(now, plan.restore_excluded)
         return display(now)
 
-    with closing(display), together(plan, scene, saver.state, display) as group:
+    with closing(display), training_group(plan, scene, saver.state, display) as group:
         adapted = plan.adapt(scene, saver.saving(show), saver.state, group)
     saver.keep()
     how = "trained"
@@ -73,8 +73,8 @@ def train(run: Run, page: AdaptPage | None) -> tuple[Plan, Adapted]:
 
 def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
     """Extracts the adapter, and applies it to the base."""
-    if hurried(adapted):
-        listen_no_more()
+    if must_exit_soon(adapted):
+        ignore_signals()
     if adapted.lost:
         adapted = replace(adapted, lost=explain(adapted.lost))
     run.console.note(*adapted.notes)
@@ -115,7 +115,7 @@ def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
     processes.
     """
     views, console = run.scene.test, run.console
-    if run.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
+    if run.stop.requests > 0 and not result.adapted.interrupted or must_exit_soon(result.adapted):
         return result
     detached = detach(result.gaussians)
     with run.watch.time("evaluate"):
@@ -169,7 +169,7 @@ def describe(run: Run, result: Result) -> dict[str, Any]:
         "version": package_version(),
         "model": args.ply,
         "scene": args.images,
-        "teacher": run.against,
+        "supervision": run.against,
         "screen_filter": asdict(result.gaussians.screen_filter),
         "base_count": adapter.base_count,
         "config": adapter.config,

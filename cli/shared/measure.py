@@ -112,7 +112,7 @@ def measure(
     if stop.requests or not views:
         return []
     with console.meter(label) as meter:
-        return evaluate(gaussians, views, dials, progress=stop.heeding(meter))
+        return evaluate(gaussians, views, dials, progress=stop.stop_on_signal(meter))
 
 
 def comparable(
@@ -129,7 +129,7 @@ def comparable(
         return unchanged
     try:
         with console.meter(Phase.FRAME_TIMES) as meter:
-            found, notes = with_frame_times(measured, views, stop.heeding(meter))
+            found, notes = with_frame_times(measured, views, stop.stop_on_signal(meter))
     except Stopped:
         return unchanged
     console.note(*notes)

@@ -15,7 +15,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import psnr
 from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render
-from clod_adapter.report.page import Picture, own_teacher, write_page
+from clod_adapter.report.page import Picture, from_checkpoint, write_page
 
 from .console import Console
 from .outputs import jsonable
@@ -43,7 +43,7 @@ def add_page(
         with interrupt_as_stopped():
             curves = training()
             with console.status(f"writing {path} ..."):
-                frames, others = pictures(model, base, scene.test, own_teacher(report))
+                frames, others = pictures(model, base, scene.test, from_checkpoint(report))
                 written = write_page(path, jsonable(report), frames, others, jsonable(curves))
     except Stopped:
         console.note("the page was interrupted and not written")

@@ -96,7 +96,7 @@ def signals_as_interrupt() -> AbstractContextManager[None]:
     return handled_by(signal.default_int_handler)
 
 
-def listen_no_more() -> None:
+def ignore_signals() -> None:
     """Ignores all until the process ends, also after the blocks above."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)

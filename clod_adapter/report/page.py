@@ -49,9 +49,9 @@ class Picture:
         return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
 
-def own_teacher(report: Mapping[str, Any]) -> bool:
+def from_checkpoint(report: Mapping[str, Any]) -> bool:
     """Whether the reference of the metrics is renders of the checkpoint, without photographs."""
-    return report.get("teacher") == "checkpoint"
+    return report.get("supervision") == "checkpoint"
 
 
 def write_page(
@@ -71,7 +71,7 @@ def write_page(
     import jinja2
 
     path = Path(path)
-    against_base = own_teacher(report)
+    against_base = from_checkpoint(report)
     series = charts.series_of(report)
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
     drawn = [line for line in series if not (against_base and line.label == charts.BASE)]

@@ -18,7 +18,7 @@ from clod_adapter.progress import GracefulStop, Listener, Phase, Progress, progr
 from clod_adapter.training.dial import require_trainable
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.paper import form_of
-from clod_adapter.training.state import Adapted, StateRefused, TrainingState
+from clod_adapter.training.state import Adapted, StateRejected, TrainingState
 from clod_adapter.training.trainer import Trainer
 
 __all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
@@ -78,7 +78,7 @@ def adapt(
     Raises:
         ClodError: no training views, none with a Gaussian in front of it, no Gaussians, an
             attribute that is not finite, a first step whose loss is not finite, ``resume`` does not
-            fit or is damaged (StateRefused), fewer views a step than processes, or a process was
+            fit or is damaged (StateRejected), fewer views a step than processes, or a process was
             lost before the first step.
         Stopped: ``progress`` returned False before training.
 
@@ -105,7 +105,7 @@ def adapt(
             try:
                 trainer.restore(resume)
             except ClodError as error:
-                raise StateRefused(str(error)) from error
+                raise StateRejected(str(error)) from error
         del resume, start, base, reduced, empty_sh  # the trainer has copies
         return _train(trainer, listener)
 

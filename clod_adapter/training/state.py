@@ -23,7 +23,7 @@ OTHER_RUN = (
 )
 
 
-class StateRefused(ClodError):
+class StateRejected(ClodError):
     """A training state does not fit the run, or is damaged."""
 
 
@@ -54,7 +54,7 @@ class TrainingState:
     def __post_init__(self) -> None:
         counted = 0 <= self.averaged <= self.steps < 2**31
         if not (counted and 0 <= self.seconds < math.inf and 0 <= self.start_seconds < math.inf):
-            raise StateRefused(
+            raise StateRejected(
                 "the training state has impossible counts of steps or seconds; start over"
             )
 
@@ -63,7 +63,7 @@ class TrainingState:
         training cannot produce.
         """
         if _layout(expected) != _layout(self.tensors):
-            raise StateRefused(OTHER_RUN)
+            raise StateRejected(OTHER_RUN)
         for name, values in self.tensors.items():
             kind, _, attribute = name.partition(".")
             if kind == "steps":  # an index in compiled code, which does not check it
@@ -75,7 +75,7 @@ class TrainingState:
             else:  # an infinite opacity does not change
                 sound = values.isfinite() | (values == expected[f"parameter.{attribute}"])
             if not bool(sound.all()):
-                raise StateRefused(
+                raise StateRejected(
                     f"the training state has impossible values of {name}; start over"
                 )
 

@@ -74,13 +74,13 @@ class Done(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def run_in(capture, dialled):
+def run_in(capture, attenuated):
     """Runs ``clod-adapt`` in a folder, in this process, to the exit code ``code``; it ``accept``s
     its loss.
 
     Text is split into words, of which BASE, SCENE, DIAL and ADAPTER are the shared files.
     """
-    places = (capture.ply, capture.scene, dialled, dialled.with_suffix(".safetensors"))
+    places = (capture.ply, capture.scene, attenuated, attenuated.with_suffix(".safetensors"))
     shared = dict(zip(("BASE", "SCENE", "DIAL", "ADAPTER"), places, strict=True))
 
     def run(folder, *words, code=0, accept=True):

@@ -23,7 +23,7 @@ from runs import contents
 
 
 @pytest.fixture(scope="module")
-def folder(capture, dialled, tmp_path_factory):
+def folder(capture, attenuated, tmp_path_factory):
     """Two scenes, a checkpoint, the files of an adapted one, a dial without calibration, and files
     of other kinds.
     """
@@ -43,7 +43,7 @@ def folder(capture, dialled, tmp_path_factory):
     (there / "nerf" / "masks" / "003.png").write_bytes(b"a mask")
     shutil.copy(capture.ply, there / "base.ply")
     for suffix in (".ply", ".safetensors", ".json"):
-        shutil.copy(dialled.with_suffix(suffix), there / f"dial{suffix}")
+        shutil.copy(attenuated.with_suffix(suffix), there / f"dial{suffix}")
     bare = clod_adapter.with_dial(capture.gaussians)
     for suffix in WRITABLE:
         write(there / f"bare{suffix}", bare if FORMATS[suffix].carries_sigma else capture.gaussians)
@@ -289,10 +289,10 @@ def test_two_runs_at_once(run_in, folder, monkeypatch, first, second, said):
                 pass
 
 
-def test_earlier_outputs_are_replaced(clod, dialled, tmp_path):
+def test_earlier_outputs_are_replaced(clod, attenuated, tmp_path):
     """And a foreign file, if the command line names it."""
     for suffix in (".safetensors", ".json"):
-        shutil.copy(dialled.with_suffix(suffix), tmp_path / f"out{suffix}")
+        shutil.copy(attenuated.with_suffix(suffix), tmp_path / f"out{suffix}")
     (tmp_path / "out.ply").write_bytes(b"foreign, but named")
     twice = (
         "render DIAL --images SCENE -o pictures",

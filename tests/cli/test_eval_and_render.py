@@ -27,13 +27,13 @@ from runs import names, pressing
 EVAL = "eval DIAL --images SCENE --json"
 
 
-def test_rows_and_default_dial_values(clod, capture, dialled):
+def test_rows_and_default_dial_values(clod, capture, attenuated):
     """The defaults are within the trained range; a plain file has one picture and no popping."""
     done = clod(EVAL)
     report = done.report
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 4]
     assert report["notes"] == []
-    assert report["model"] == str(dialled) and report["scene"] == str(capture.scene)
+    assert report["model"] == str(attenuated) and report["scene"] == str(capture.scene)
     assert report["base_count"] == 300
     for row in report["rows"]:
         assert row["in_view"] <= row["kept"] and row["frame_ms_range"] >= 0
@@ -83,10 +83,10 @@ def test_base_by_rank_and_popping(clod, capture):
     assert re.search(r"^ +steps +mean", done.err, re.M)
 
 
-def test_against_at_matched_counts(clod, capture, dialled, tmp_path):
+def test_against_at_matched_counts(clod, capture, attenuated, tmp_path):
     """Files of one name have their folders as labels."""
     # within the dial's reach
-    count = int(sum(row.kept for row in load(dialled).calibration.rows[::4]) // 2)
+    count = int(sum(row.kept for row in load(attenuated).calibration.rows[::4]) // 2)
     for name, size in (("a", count), ("b", 300)):
         (tmp_path / name).mkdir()
         capture.write(tmp_path / name / "cloud.ply", capture.gaussians[:size])
@@ -143,11 +143,11 @@ def test_frames_are_timed_together(clod, monkeypatch):
     assert [(row["virtual_scale"], round(row["frame_ms"])) for row in rows] == [(3, 333), (1, 1000)]
 
 
-def test_eval_at_a_budget(clod, dialled):
+def test_eval_at_a_budget(clod, attenuated):
     """Within the range, at s = 1 if that is enough; a psnr drop out of reach gives the range's end;
     with notes.
     """
-    rows = load(dialled).calibration.rows
+    rows = load(attenuated).calibration.rows
     middle = round(rows[0].kept * 0.4 + rows[-1].kept * 0.6)
     report = clod(EVAL, "--keep", middle, 300).report
     solved, whole = report["rows"]
@@ -171,8 +171,8 @@ def test_eval_at_a_budget(clod, dialled):
     assert re.match(r"--fps 1: s = 1 \(s = 1 draws \d+ frames a second already\)", solved)
 
 
-def test_baking_to_a_budget(clod, dialled):
-    model = load(dialled)
+def test_baking_to_a_budget(clod, attenuated):
+    model = load(attenuated)
     table = model.calibration
     rows = tuple(replace(row, frame_ms=8 / row.virtual_scale) for row in table.rows)
     elsewhere = replace(table, rows=rows, machine="another", width=640, height=480)
@@ -187,7 +187,7 @@ def test_baking_to_a_budget(clod, dialled):
     assert output["virtual_scale"] == pytest.approx(rows[2].virtual_scale)
 
 
-def test_device_presets_are_counts(clod, capture, dialled, monkeypatch):
+def test_device_presets_are_counts(clod, capture, attenuated, monkeypatch):
     """For export the count of the file, for view and a page the dial value that they open at."""
     assert [*DEVICES] == ["quest3", "phone", "laptop", "desktop"]
     assert sorted(DEVICES.values()) == [*DEVICES.values()]
@@ -195,11 +195,11 @@ def test_device_presets_are_counts(clod, capture, dialled, monkeypatch):
     done = clod("export DIAL --device-preset quest3 -o few.ply --json")
     assert 115 <= done.report["outputs"][0]["count"] == len(load("few.ply").gaussians) <= 120
     assert done.note("preset").startswith("--device-preset quest3, --keep 120: s = ")
-    words = f"{dialled} --images {capture.scene} --device-preset quest3".split()
+    words = f"{attenuated} --images {capture.scene} --device-preset quest3".split()
     answers, report = view.make_page(build_parser("view").parse_args(words), view.Console(True))
     page = b"".join(answers["/"].blocks()).decode()
     opening = float(re.findall(r'"virtual_scale": ([\d.]+)[,}]', page)[-1])
-    model = load(dialled).gaussians
+    model = load(attenuated).gaussians
     scene = load_scene(capture.scene)
     views = scene.train + scene.test
     kept = fmean(int(render(model, view.camera, opening).kept.sum()) for view in views)
@@ -210,7 +210,7 @@ def test_device_presets_are_counts(clod, capture, dialled, monkeypatch):
 RENDER = "render DIAL --images SCENE --json -o"
 
 
-def test_an_image_per_view(clod, capture, dialled, tmp_path):
+def test_an_image_per_view(clod, capture, attenuated, tmp_path):
     """Of the held-out views, of all, or of one, for which a count is solved."""
     done = clod(RENDER, "out/here --sv 1 3 --beside")
     assert done.report["virtual_scales"] == [1, 3] and not done.report["interrupted"]
@@ -218,7 +218,7 @@ def test_an_image_per_view(clod, capture, dialled, tmp_path):
     shown = [Path(picture["file"]).name for picture in pictures]
     assert names(tmp_path / "out" / "here") == shown == ["000.png", "008.png"]
     scene = load_scene(capture.scene)
-    gaussians = load(dialled).gaussians
+    gaussians = load(attenuated).gaussians
     for held_out, picture in zip(scene.test, pictures, strict=True):
         pixels = np.asarray(Image.open(picture["file"]))
         assert pixels.shape == (48, 3 * 64, 3)

@@ -71,9 +71,9 @@ def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-def test_baking(clod, capture, dialled):
+def test_baking(clod, capture, attenuated):
     done = clod(EXPORT, "--sv 2 -o x.ply")
-    want = baked(dialled, 2.0)
+    want = baked(attenuated, 2.0)
     data = Path("x.ply").read_bytes()
     size = len(data)
     assert done.output == {"file": "x.ply", "virtual_scale": 2, "count": len(want), "bytes": size}
@@ -87,11 +87,11 @@ def test_baking(clod, capture, dialled):
     assert head.startswith(lines) and rows == inria_rows(want).tobytes()
 
 
-def test_baking_for_other_cameras(clod, capture, dialled):
+def test_baking_for_other_cameras(clod, capture, attenuated):
     """Those of a scene, one of them, and placed ones for a file without cameras."""
     report = clod(EXPORT, "--sv 2 --images SCENE -o x.ply").report
     cameras = [view.camera for view in load_scene(capture.scene).train]
-    model = load(dialled).gaussians
+    model = load(attenuated).gaussians
     want = bake(model, 2.0, cameras=cameras)
     assert report["cameras"] == 8
     assert_close(load("x.ply").gaussians.opacity_logits, want.opacity_logits)
@@ -122,19 +122,21 @@ def camera_003(cameras):
     return next(camera for camera in cameras if camera.name == "003.png")
 
 
-def test_levels(clod, dialled, tmp_path):
+def test_levels(clod, attenuated, tmp_path):
     outputs = clod(EXPORT, "--levels 1,2.5,4 -o some.set.ply").report["outputs"]
     names = ["some.set_s1.ply", "some.set_s2.5.ply", "some.set_s4.ply"]
     assert files(tmp_path) == names == [output["file"] for output in outputs]
-    assert [load(name).gaussians for name in names] == [baked(dialled, s) for s in (1.0, 2.5, 4.0)]
+    assert [load(name).gaussians for name in names] == [
+        baked(attenuated, s) for s in (1.0, 2.5, 4.0)
+    ]
 
 
-def test_sets_have_a_level_for_each_band_of_distances(clod, dialled, tmp_path):
+def test_sets_have_a_level_for_each_band_of_distances(clod, attenuated, tmp_path):
     """The finest is the checkpoint; in others are those that reach the middle of the band, as large
     as there.
     """
     done = clod(EXPORT, "--3dtiles --multiplier 2 -o tiles")
-    model = load(dialled).gaussians
+    model = load(attenuated).gaussians
     counts = [level["count"] for level in done.output["levels"]]
     begins = [level["begins"] for level in done.output["levels"]]
     near = model.attenuation.near_distance
@@ -177,8 +179,8 @@ def test_a_lower_sh_degree_is_fitted(clod, capture):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".splat"])
-def test_formats(clod, dialled, suffix):
-    model = load(dialled)
+def test_formats(clod, attenuated, suffix):
+    model = load(attenuated)
     kept = suffix != ".splat"
     done = clod(EXPORT, f"-o x{suffix}", "" if kept else "--sv 1")
     output = done.output
@@ -195,15 +197,15 @@ def test_formats(clod, dialled, suffix):
     assert header.count("comment baked at s = 2 by clod-adapter for 8 training cameras\n") == kept
 
 
-def test_losses_are_noted(clod, dialled):
+def test_losses_are_noted(clod, attenuated):
     """Harmonics and foreign columns; positions far from 0 become doubles. Columns of settings are
     not dropped.
     """
     done = clod("export BASE -o x.splat --json")
     wanted = {"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}
     assert done.output == wanted and done.note("view-dependent colour is dropped")
-    model = load(dialled)
-    element = PlyData.read(str(dialled), mmap=False)["vertex"]
+    model = load(attenuated)
+    element = PlyData.read(str(attenuated), mmap=False)["vertex"]
     labelled = with_columns(element.data, label=7)
     write_rows(Path("labelled.ply"), labelled, comments=element.comments)
     assert clod("export labelled.ply -o x.ply --json").report["notes"] == ["columns dropped: label"]
@@ -217,7 +219,7 @@ def test_losses_are_noted(clod, dialled):
     write_rows(Path("far.ply"), far, comments=write_comments(settings))
     assert clod("export far.ply --sv 2 -o x.ply --json").note("x, y and z are doubles")
     again = load("x.ply")
-    assert len(again.gaussians) == len(baked("far.ply", 2.0)) == len(baked(dialled, 2.0))
+    assert len(again.gaussians) == len(baked("far.ply", 2.0)) == len(baked(attenuated, 2.0))
     assert 436_000 < again.vertex["x"].mean() < 438_000
 
 
@@ -243,7 +245,7 @@ def test_order_by_extinction(clod, capture):
     assert load("one.ply").gaussians == bake(ordered, 2.0, camera)
 
 
-def test_splat_transform(clod, dialled, tmp_path, tool):
+def test_splat_transform(clod, attenuated, tmp_path, tool):
     tool()
     done = clod(EXPORT, "--sv 4 -o x.sog")
     said = json.loads(Path("x.sog").read_text())
@@ -255,7 +257,7 @@ def test_splat_transform(clod, dialled, tmp_path, tool):
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
     (tmp_path / "-o").mkdir()  # empty; not an option of the tool
     output = clod(EXPORT, "--lod-meta --out=-o").output
-    counts = [len(level.gaussians) for level in bake_levels(load(dialled).gaussians)]
+    counts = [len(level.gaussians) for level in bake_levels(load(attenuated).gaussians)]
     assert [level["count"] for level in output["levels"]] == counts
     assert output["count"] == sum(counts)
     assert files(tmp_path / "-o") == ["0_0", "0_0/a.webp", "lod-meta.json"]
@@ -291,14 +293,14 @@ def test_failure_of_the_tool_leaves_no_file(
     assert done.err.endswith(said) and files(tmp_path) == [], done
 
 
-def test_the_real_tool(clod, dialled, tmp_path):
+def test_the_real_tool(clod, attenuated, tmp_path):
     try:
         splat_transform.SplatTransform.find()
     except ClodError as error:
         pytest.skip(str(error))
     clod("export DIAL --lod-meta --multiplier 2 -o out")
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
-    levels = bake_levels(load(dialled).gaussians, 2.0)
+    levels = bake_levels(load(attenuated).gaussians, 2.0)
     assert meta["counts"] == [len(level.gaussians) for level in levels]
     assert meta["lodLevels"] == len(levels)
     assert all((tmp_path / "out" / name).is_file() for name in meta["filenames"])
@@ -306,7 +308,7 @@ def test_the_real_tool(clod, dialled, tmp_path):
 
 
 @pytest.mark.usefixtures("without_splat_transform")
-def test_page_holds_the_splat_and_its_dial(clod, dialled, tmp_path):
+def test_page_holds_the_splat_and_its_dial(clod, attenuated, tmp_path):
     def page(*words, name):
         """What was printed, the settings of the page, and the splat in it."""
         done = clod(EXPORT, "-o page.html", *words)
@@ -316,7 +318,7 @@ def test_page_holds_the_splat_and_its_dial(clod, dialled, tmp_path):
         return done, json.loads(config), load(name)
 
     done, config, held = page("--sv 9 --images SCENE", name="held.spz")
-    assert config["model"]["name"] == dialled.name and config["virtual_scale"] == 4
+    assert config["model"]["name"] == attenuated.name and config["virtual_scale"] == 4
     assert done.note("dial ends at s = 4")
     assert "Gaussians, initial dial value s = 4" in done.err
     assert " of " not in done.err.splitlines()[-1]
@@ -327,22 +329,22 @@ def test_page_holds_the_splat_and_its_dial(clod, dialled, tmp_path):
     said = re.search(r"PSNR of (\S+) dB against the exact file \(s = 1\)", done.err)
     assert said and float(said[1]) > 40 and [*tmp_path.glob(".tmp-*")] == []
     done, _, held = page("--exact", name="held.ply")
-    assert "PSNR" not in done.err and held.gaussians == load(dialled).gaussians
+    assert "PSNR" not in done.err and held.gaussians == load(attenuated).gaussians
 
 
-def test_a_page_of_several_models(clod, dialled, tmp_path):
+def test_a_page_of_several_models(clod, attenuated, tmp_path):
     """Of the same name in two folders; each has its own data."""
-    other = tmp_path / "other" / dialled.name
+    other = tmp_path / "other" / attenuated.name
     other.parent.mkdir()
-    save(other, load(dialled).gaussians[:100])
+    save(other, load(attenuated).gaussians[:100])
     done = clod("export DIAL", other, "--exact --json -o page.html")
-    assert done.report["files"] == [str(dialled), str(other)] and done.output["count"] == 400
+    assert done.report["files"] == [str(attenuated), str(other)] and done.output["count"] == 400
     text = (tmp_path / "page.html").read_text("utf-8")
     (config,) = re.findall(r'id="clod-config">(.*?)</script>', text)
     entries = [json.loads(config)["model"], *json.loads(config)["others"]]
-    names = [f"{path.parent.name}/{path.name}" for path in (dialled, other)]
+    names = [f"{path.parent.name}/{path.name}" for path in (attenuated, other)]
     assert [entry["name"] for entry in entries] == names
-    for entry, path in zip(entries, (dialled, other), strict=True):
+    for entry, path in zip(entries, (attenuated, other), strict=True):
         (data,) = re.findall(f'id="{entry["element"]}">(.*?)</script>', text)
         Path("held.ply").write_bytes(base64.b64decode(data))
         assert load("held.ply").gaussians == load(path).gaussians

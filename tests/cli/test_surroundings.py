@@ -41,12 +41,12 @@ def assert_one_error(done):
     assert "cannot be written" in error and done.out == ""
 
 
-def test_full_disk_while_adapting(clod, dialled, tmp_path):
+def test_full_disk_while_adapting(clod, attenuated, tmp_path):
     """One line, and unchanged files of an earlier run. Without room for the page the others are
     complete.
     """
     words = "BASE --images SCENE --iters 2 --max-sv 2 -o dial.ply"
-    shutil.copytree(dialled.parent, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(attenuated.parent, tmp_path, dirs_exist_ok=True)
     earlier = contents(tmp_path)
     report, adapter, ply = (
         len(earlier[tmp_path / f"dial.{suffix}"]) for suffix in ("json", "safetensors", "ply")
@@ -179,7 +179,7 @@ robustness ODD.ply --images ODD --iters 2 --max-sv 2 -o OUT_cells
 
 
 @pytest.mark.usefixtures("without_splat_transform", "blank_figure")
-def test_names_that_are_not_utf8(clod, capture, dialled, tmp_path):
+def test_names_that_are_not_utf8(clod, capture, attenuated, tmp_path):
     """Of a scene, its checkpoint and a file with a dial, their folder, and all outputs."""
     folder = tmp_path / ODD
     try:
@@ -187,7 +187,7 @@ def test_names_that_are_not_utf8(clod, capture, dialled, tmp_path):
     except OSError:
         pytest.skip("the file system takes UTF-8 only")
     shutil.copytree(capture.scene, folder / ODD)
-    for file, name in ((capture.ply, ".ply"), (dialled, "_dial.ply")):
+    for file, name in ((capture.ply, ".ply"), (attenuated, "_dial.ply")):
         shutil.copy(file, folder / f"{ODD}{name}")
     for line in OF_ODD_NAMES.strip().splitlines():
         words = line.replace("ODD", str(folder / ODD)).replace("OUT", str(folder / "out" / ODD))

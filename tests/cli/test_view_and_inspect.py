@@ -35,8 +35,8 @@ def assert_holds(data, file, folder):
     assert len(served) == len(shown) and (served.attenuation is None) == (shown.attenuation is None)
 
 
-def test_serves_until_it_is_interrupted(server, capture, dialled, tmp_path):
-    line = f"view {dialled} --base {capture.ply} --images {capture.scene} --sv 2 --no-browser"
+def test_serves_until_it_is_interrupted(server, capture, attenuated, tmp_path):
+    line = f"view {attenuated} --base {capture.ply} --images {capture.scene} --sv 2 --no-browser"
     process = server.start(tmp_path, *line.split(), "--json", "--quiet")
     wait_for(Path(f"{tmp_path}.log"), "\n")
     report = json.loads(log_of(tmp_path))
@@ -45,14 +45,14 @@ def test_serves_until_it_is_interrupted(server, capture, dialled, tmp_path):
     assert config["title"] == "dial.ply"
     assert config["virtual_scale"] == 2
     assert len(config["cameras"]) == 10
-    for name, file in ("model", dialled), ("base", capture.ply):
+    for name, file in ("model", attenuated), ("base", capture.ply):
         assert config[name]["href"] == f"/files/{name}"
         assert_holds(fetch(f"{report['url']}files/{name}"), file, tmp_path)
     os.kill(process, signal.SIGTERM)
     assert server.wait(process) == 0 and log_of(tmp_path).count("\n") == 1
 
 
-def test_dial_values_and_files_of_a_page(capture, dialled, tmp_path, capsys):
+def test_dial_values_and_files_of_a_page(capture, attenuated, tmp_path, capsys):
     """Of a folder the splats by name, numbers by value; files of one name have those of their
     folders. With notes.
     """
@@ -64,14 +64,14 @@ def test_dial_values_and_files_of_a_page(capture, dialled, tmp_path, capsys):
         return answers, report, config_of(b"".join(answers["/"].blocks()))
 
     for path, opens, said in (
-        (dialled, 4, "the page's dial ends at s = 4"),
+        (attenuated, 4, "the page's dial ends at s = 4"),
         (capture.ply, 1, "s = 9 has no effect"),
     ):
         _, report, config = page_of(path, "--sv=9")
         (note,) = [note for note in report["notes"] if said in note]
         assert config["virtual_scale"] == opens and note in capsys.readouterr().err
     (tmp_path / "more").mkdir()
-    files = {"lod2.ply": dialled, "lod10.ply": dialled, "more/lod2.ply": capture.ply}
+    files = {"lod2.ply": attenuated, "lod10.ply": attenuated, "more/lod2.ply": capture.ply}
     for name, file in files.items():
         shutil.copy(file, tmp_path / name)
     (tmp_path / "points.ply").write_text(
@@ -120,7 +120,7 @@ def test_a_plain_file_fits_on_a_screen(clod, capture):
     assert len({len(line) for line in table}) == 1
 
 
-def test_a_dial_and_its_calibration(clod, dialled):
+def test_a_dial_and_its_calibration(clod, attenuated):
     text = clod("inspect DIAL").out
     report = clod("inspect DIAL --json").report
     lines = text.splitlines()
@@ -130,10 +130,10 @@ def test_a_dial_and_its_calibration(clod, dialled):
     at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
     table = [line.split() for line in lines[at + 1 : at + 8]]
     assert table[0][0] == "1" and table[-1][0] == "4" and {len(row) for row in table} == {5}
-    assert report["command"] == "inspect" and report["path"] == str(dialled)
+    assert report["command"] == "inspect" and report["path"] == str(attenuated)
     assert report["oddities"] == [] and "anomalies" not in report
     assert splat["count"] == splat["total"] == 540
-    told = json.loads(dialled.with_suffix(".json").read_text())
+    told = json.loads(attenuated.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]
     clod("export DIAL --sv 2 -o x.ply")
     comment = "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n"

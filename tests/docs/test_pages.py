@@ -79,7 +79,7 @@ def spoken(page, program):
 
 
 @pytest.fixture(scope="session")
-def desk(capture, dialled, tmp_path_factory):
+def desk(capture, attenuated, tmp_path_factory):
     """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout),
     ``pretrained_clod.*``, and ``demo/`` with the demo's file names.
     """
@@ -89,10 +89,10 @@ def desk(capture, dialled, tmp_path_factory):
     masks = {"masks_0": np.where(np.arange(len(capture.gaussians)) % 10 == 0, -4, 4), "masks_1": 0}
     without_comments(folder / "pretrained.ply", **masks).rename(folder / "pretrained_mask.ply")
     for suffix in (".ply", ".safetensors", ".json"):
-        shutil.copyfile(dialled.with_suffix(suffix), folder / f"pretrained_clod{suffix}")
+        shutil.copyfile(attenuated.with_suffix(suffix), folder / f"pretrained_clod{suffix}")
     shutil.copytree(capture.scene, folder / "demo" / "capture")
     shutil.copyfile(capture.ply, folder / "demo" / "base.ply")
-    shutil.copyfile(dialled, folder / "demo" / "gallery.ply")
+    shutil.copyfile(attenuated, folder / "demo" / "gallery.ply")
     return folder
 
 

@@ -32,7 +32,7 @@ from runs import counted
 from scenes import gaussians, ring, seeded
 
 
-def dialled():
+def attenuated():
     """Gaussians that end at different dial values; scene distance 4, where the ring of cameras
     is.
     """
@@ -65,7 +65,7 @@ def test_popping_of_a_fade_and_of_a_switch():
 
 
 def test_dial_sweep_measures_its_renders():
-    model = dialled()
+    model = attenuated()
     camera = ring(3, 32, 24)[1]
     steps = []
     result = dial_popping(model, camera, 3.0, steps=4, progress=counted(steps))
@@ -76,7 +76,7 @@ def test_dial_sweep_measures_its_renders():
 
 
 def test_camera_motion_alone_is_no_change():
-    model = dialled()
+    model = attenuated()
     cameras = ring(12, 32, 24)[:3]
     still = path_popping(model.replace(sigma_d=torch.full((200,), 1e9)), cameras, 3.0, steps=6)
     assert still.largest == 0 and still.pixel == 0

@@ -78,7 +78,7 @@ def test_removal_error_depends_on_the_seed_alone():
         usable_views(gaussians(20, 0, 0), [blind])
 
 
-def dialled(n, **settings):
+def attenuated(n, **settings):
     """An initialized dial, and the views that it is from."""
     views = photograph(gaussians(n, 0, 0), ring(3, 20, 16))
     return initialize(gaussians(n, 0, 0), views, AdaptConfig(**settings)), views
@@ -94,7 +94,7 @@ def test_kept_shares_follow_the_target_curve(share, exponent, n=1000):
     """At the distances of the initialization, ``1 / (s^p + (1/share - 1) s^-p)``, to one
     Gaussian.
     """
-    model, views = dialled(n, start_share=share, exponent=exponent)
+    model, views = attenuated(n, start_share=share, exponent=exponent)
     for s in (1.0, 1.2, 1.7, 2.0, 3.0, 5.0, 7.0, 15.0):
         kept = dial(model, distances_of(model, views), s).keep
         want = 1 / (s**exponent + (1 / share - 1) * s**-exponent)
@@ -103,7 +103,7 @@ def test_kept_shares_follow_the_target_curve(share, exponent, n=1000):
 
 def test_initialization_culls_in_the_pruning_order():
     """In which one that a neighbour replaces goes earlier than by its removal error alone."""
-    model, views = dialled(200)
+    model, views = attenuated(200)
 
     error = removal_error(model, views, seed=0)
     found = (model.sigma_d / distances_of(model, views)).argsort()
@@ -182,6 +182,6 @@ def test_growth_begins_with_0_where_it_is_trained():
 
 def test_a_dial_of_another_form_is_refused():
     """Its numbers mean something else."""
-    adapted, views = dialled(20, iters=1)
+    adapted, views = attenuated(20, iters=1)
     with refused("has the form ours; adapt with the same"):
         initialize(adapted, views, AdaptConfig.paper())

@@ -96,7 +96,7 @@ def through_hook(checkpoint, monkeypatch):
 
 def adapted(**settings):
     """60 Gaussians, of which a third is culled at the dial value, with growth of both signs."""
-    some = scenes.dialled(60, 1, 3, **settings)
+    some = scenes.attenuated(60, 1, 3, **settings)
     values = torch.rand(60, generator=scenes.seeded(5))
     return some.replace(
         means=some.means * torch.tensor([1, 1, 0.5]),

@@ -137,7 +137,7 @@ def test_the_code_of_the_page_runs(tmp_path, monkeypatch):
     20 ms a frame.
     """
     monkeypatch.chdir(tmp_path)
-    adapted = scenes.dialled(300, 1, 3, scene_distance=1.0, reference_distance=5.0)
+    adapted = scenes.attenuated(300, 1, 3, scene_distance=1.0, reference_distance=5.0)
     adapted = adapted.replace(growth_d=torch.linspace(0, 1, 300))
     clod_adapter.save("model.ply", adapted)
     own = {"my_opacity": my_opacity, "my_scale": my_scale}

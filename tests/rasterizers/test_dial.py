@@ -13,7 +13,7 @@ from backends import torch_threads
 from clod_adapter.config import FORMS, ScreenFilter
 from clod_adapter.equation.attenuation import SIGMA_MAX, dial
 from clod_adapter.rasterizers import Rasterizer, cpu, for_device, reference
-from scenes import camera, dialled, gaussians, seeded
+from scenes import attenuated, camera, gaussians, seeded
 
 VIEW = camera(45, 37)
 KERNELS, COMPOSED = for_device(torch.device("cpu")), Rasterizer(cpu.rasterize)
@@ -65,7 +65,7 @@ def assert_same(model, s, *frozen):
 @pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 33, 200])
 def test_counts_around_sixteen(n):
     with torch_threads(3):
-        slopes = assert_same(dialled(n, 2, n).replace(growth_d=torch.linspace(-1, 2, n)), 2.0)
+        slopes = assert_same(attenuated(n, 2, n).replace(growth_d=torch.linspace(-1, 2, n)), 2.0)
     assert n < 33 or all(bool(slope.any()) for slope in slopes.values())
 
 
@@ -79,7 +79,7 @@ def test_counts_around_sixteen(n):
     mip=st.booleans(),
 )
 def test_any_settings(grows, s, seed, reference, mip, form):
-    model = dialled(90, 0, seed, reference_distance=reference, max_sv=45.0, form=form)
+    model = attenuated(90, 0, seed, reference_distance=reference, max_sv=45.0, form=form)
     model = model.replace(screen_filter=ScreenFilter(compensate=mip))
     if grows:
         model = model.replace(growth_d=torch.linspace(-1, 1.5, 90).roll(seed))
@@ -88,7 +88,7 @@ def test_any_settings(grows, s, seed, reference, mip, form):
 
 def test_the_end_of_the_reach():
     """Gaussians at 0.9 to 1.01 of their reaches; and which are kept, to the rounding of float32."""
-    model = dialled(3000, 0, 5)
+    model = attenuated(3000, 0, 5)
     far = (model.means - VIEW.position).norm(dim=1) * 2 / 3
     faint = model.replace(sigma_d=far / torch.linspace(0.9, 1.01, 3000))[::10]
     assert (
@@ -102,7 +102,7 @@ def test_the_end_of_the_reach():
 
 
 def test_frozen_attributes_and_models_without_a_dial():
-    model = dialled(120, 1, 4).replace(growth_d=torch.full((120,), 0.5))
+    model = attenuated(120, 1, 4).replace(growth_d=torch.full((120,), 0.5))
     for frozen in (SHAPE, COLOUR, (*SHAPE, *COLOUR), ("sigma_d", "opacity_logits"), SHAPE[:3]):
         assert_same(model, 2.0, *frozen)
     assert_same(gaussians(100, 2, 0), 3.0)
@@ -118,7 +118,7 @@ def test_extreme_values():
     )
     rows = torch.cartesian_prod(*(torch.tensor(x) for x in (sigmas, logits, growths)))
     for s in (0.0, 1.0, 5.0):
-        model = dialled(len(rows), 0, 3).replace(sigma_d=rows[:, 0], opacity_logits=rows[:, 1])
+        model = attenuated(len(rows), 0, 3).replace(sigma_d=rows[:, 0], opacity_logits=rows[:, 1])
         model.means[::7] = VIEW.position
         model = model.replace(growth_d=rows[:, 2])
         for x in KERNELS.draw(model, VIEW, s):
@@ -137,7 +137,7 @@ def test_a_row_with_infinite_sigma_has_no_dial(rasterizer):
     gradient.
     """
     model = gaussians(60, 0, 1)
-    fixed = dialled(60, 0, 1, max_sv=45.0).replace(
+    fixed = attenuated(60, 0, 1, max_sv=45.0).replace(
         sigma_d=torch.full((60,), math.inf), growth_d=torch.zeros(60)
     )
     image, alpha, slopes = results(rasterizer, fixed, 40.0)
@@ -150,7 +150,7 @@ def test_a_row_with_infinite_sigma_has_no_dial(rasterizer):
 
 
 def test_distances_of_another_camera_and_a_growth_that_is_not_finite():
-    model, other = dialled(50, 0, 1), camera(45, 37, fov=70)
+    model, other = attenuated(50, 0, 1), camera(45, 37, fov=70)
     found = [each.draw(model, VIEW, 2.0, seen_from=other)[0] for each in (KERNELS, COMPOSED)]
     assert torch.equal(*found)
     assert (
@@ -159,7 +159,7 @@ def test_distances_of_another_camera_and_a_growth_that_is_not_finite():
 
 
 def test_gradients_beyond_the_trained_rows_are_0():
-    model = away_from_thresholds(dialled(90, 1, 2).replace(growth_d=torch.full((90,), 0.5)), 2.0)
+    model = away_from_thresholds(attenuated(90, 1, 2).replace(growth_d=torch.full((90,), 0.5)), 2.0)
     want, leaves = (
         results(KERNELS, model, 2.0)[2],
         {k: x.clone().requires_grad_() for k, x in model.tensors().items()},

@@ -84,7 +84,7 @@ def test_page_is_self_contained_and_escaped(tmp_path, monkeypatch):
     for png in (written["rendering"], written["adapting"]):
         pixels = np.asarray(Image.open(png).convert("RGB"))
         assert min(pixels.shape[:2]) > 500 and 0.005 < (pixels < 128).any(2).mean() < 0.3
-    own = report(rows=[], base_rows=[], detached_row=None, teacher="checkpoint")
+    own = report(rows=[], base_rows=[], detached_row=None, supervision="checkpoint")
     write_page(path, own, frames, {"base": frames[0]})
     text = path.read_text("utf-8")
     for part in ("Nothing was measured", "steps on synthetic views", "hold for base"):

@@ -35,15 +35,17 @@ def test_images_are_renders_of_the_checkpoint(blob):
     """Renders of a file with a dial are at s = 1."""
     cameras = ring(9, 40, 30)
     steps = []
-    dialled = with_dial(blob, torch.full((len(blob),), 0.3), AttenuationConfig(scene_distance=4.0))
-    scene = render_pseudo_views(dialled, cameras, progress=counted(steps))
+    attenuated = with_dial(
+        blob, torch.full((len(blob),), 0.3), AttenuationConfig(scene_distance=4.0)
+    )
+    scene = render_pseudo_views(attenuated, cameras, progress=counted(steps))
     assert [view.camera for view in scene.test] == [cameras[0], cameras[8]]
     assert len(scene.train) == 7 and steps == [(1, 2), (2, 2)]
     image = scene.train[0].image
-    assert torch.equal(image, render(dialled, cameras[1]).pixels)
+    assert torch.equal(image, render(attenuated, cameras[1]).pixels)
     assert not torch.equal(image, render(blob, cameras[1]).pixels)
     assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0]
-    assert render_pseudo_views(dialled, cameras[:1]).test == ()
+    assert render_pseudo_views(attenuated, cameras[:1]).test == ()
 
 
 def test_each_step_renders_the_checkpoint_from_another_camera(blob):

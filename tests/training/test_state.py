@@ -183,12 +183,12 @@ def session_of(capture):
     (row,) = evaluate(adapted, scene.test, [2.0])
     plan = make_plan(base, scene)
     baked = clod.bake(adapted, 2, cameras=cameras)
-    dialled = [
+    attenuated = [
         attached.sigma_d,
         clod.place_cameras(base, views=2)[0].viewmat,
         *baked.tensors().values(),
     ]
-    return [*adapted.tensors().values(), image, *dialled], repr(
+    return [*adapted.tensors().values(), image, *attenuated], repr(
         (plan.decisions, row.psnr, row.kept)
     )
 

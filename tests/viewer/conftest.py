@@ -58,7 +58,7 @@ def save(tmp_path):
 @pytest.fixture(scope="session")
 def gaussians():
     """400 Gaussians of SH degree 1 with a dial."""
-    return scenes.dialled(400, 1, 5).replace(sigma_d=torch.linspace(0.1, 15, 400))
+    return scenes.attenuated(400, 1, 5).replace(sigma_d=torch.linspace(0.1, 15, 400))
 
 
 @pytest.fixture(scope="session")

@@ -166,7 +166,7 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page, about):
 @pytest.mark.parametrize("viewer, suffix", [("spark", "spz"), ("playcanvas", "ply")])
 def test_the_dial_is_as_exact_as_the_viewer(tabs, viewer, suffix, tmp_path):
     about = json.loads((KIT / "cameras.json").read_text())["cameras"][0]
-    undialled = 0.0
+    no_decay = 0.0
     with opened(tabs, viewer, KIT / f"kit.{suffix}") as page:
         page.wait_for_function("window.dial")
         page.evaluate("document.forms[0].hidden = true")
@@ -177,8 +177,8 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs, viewer, suffix, tmp_path):
             assert page.evaluate("dial.kept") == pytest.approx(frame["kept"], rel=within)
             wanted = read_picture(KIT / frame["picture"])
             psnr = peak_signal_noise_ratio(wanted, settled(page), data_range=255)
-            undialled = undialled or psnr
-            assert psnr > max(undialled - 1, 25), (frame["s"], psnr, undialled)
+            no_decay = no_decay or psnr
+            assert psnr > max(no_decay - 1, 25), (frame["s"], psnr, no_decay)
             if viewer == "spark":  # drops opacities below its 8 bits
                 assert page.evaluate("spark.activeSplats") == pytest.approx(frame["kept"], rel=0.05)
         for value in ("5.01", "-1", "NaN", "'3'", "undefined", "{ keep: 'x' }", "{ keep: 0.5 }"):
@@ -211,7 +211,10 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs, viewer, suffix, tmp_path):
         )
         for model, error in (
             (scenes.gaussians(50, 0, 7), "the file has no sigma_d, so no dial; adapt it with"),
-            (scenes.dialled(50, 0, 7, form="paper"), "the paper's form, which viewers do not draw"),
+            (
+                scenes.attenuated(50, 0, 7, form="paper"),
+                "the paper's form, which viewers do not draw",
+            ),
         ):
             clod_adapter.save(tmp_path / "refused.ply", model)
             data = list((tmp_path / "refused.ply").read_bytes())

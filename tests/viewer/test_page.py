@@ -18,7 +18,7 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.render import render
 from clod_adapter.viewer import page
 from runs import data_in
-from scenes import dialled
+from scenes import attenuated
 from shown import Shown, assert_same, decoded, serve
 
 VIEWER = Path(clod_adapter.__file__).parent / "viewer"
@@ -79,7 +79,7 @@ def test_the_text_of_one_file(tmp_path):
 
 def test_the_exact_file_is_a_plain_ply(capture, tmp_path):
     """In blocks of rows, without empty SH degrees and rows that were dropped."""
-    model = dialled(20_000, 3, 3, scene_distance=1.0)
+    model = attenuated(20_000, 3, 3, scene_distance=1.0)
     model = model.replace(shN=model.shN.where(torch.arange(15)[:, None] < 8, 0))
     model.means[7, 1] = torch.nan
     capture.write(tmp_path / "a.ply", model)
@@ -101,7 +101,7 @@ def test_a_page_of_one_file(show, save, monkeypatch, exact):
     """
     monkeypatch.setattr(page, "PART", 15_000)
     size = 1000.0
-    model = dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
+    model = attenuated(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
     far = model.replace(
         means=size * model.means,
         log_scales=model.log_scales + float(np.log(size)),

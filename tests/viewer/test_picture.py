@@ -21,7 +21,7 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
 from clod_adapter.viewer.page import Payload, write_viewer_page
 from formats import PACKED, splat_transform, write_rows
-from scenes import dialled
+from scenes import attenuated
 from shown import TALL, assert_alike, assert_same, drop, message, take
 
 VIEW = scenes.camera(320, 240)
@@ -36,13 +36,13 @@ def grown(count, degree, power, by, **settings):
     """With growth of both signs; some Gaussians have their centre outside the picture and grow into
     it.
     """
-    model = dialled(count, degree, 7, **settings)
+    model = attenuated(count, degree, 7, **settings)
     return finer(model, by, growth_d=torch.linspace(-1, power, count))
 
 
 def small(size):
     """In another unit of length, with a nearer near plane."""
-    model = dialled(500, 0, 7, scene_distance=3 * size)
+    model = attenuated(500, 0, 7, scene_distance=3 * size)
     viewmat = VIEW.viewmat.clone()
     viewmat[:3, 3] *= size
     model = finer(model, -float(np.log(size)), means=size * model.means)
@@ -51,10 +51,10 @@ def small(size):
 
 # Model, dial values and camera; each differs from the others in what is named.
 CASES = {
-    "degree 3": (dialled(500, 3, 7), (1.0, 3.0), VIEW),
-    "compensated": (finer(dialled(500, 1, 7), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW),
+    "degree 3": (attenuated(500, 3, 7), (1.0, 3.0), VIEW),
+    "compensated": (finer(attenuated(500, 1, 7), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW),
     "another unit, wide blur": (
-        finer(dialled(500, 1, 7, scene_distance=2.0), 2, screen_filter=WIDE),
+        finer(attenuated(500, 1, 7, scene_distance=2.0), 2, screen_filter=WIDE),
         (2.0,),
         VIEW,
     ),
@@ -72,7 +72,7 @@ CASES = {
     ),
     "millimetres": small(1e-3),
     "off centre": (
-        dialled(500, 0, 7),
+        attenuated(500, 0, 7),
         (1.0,),
         scenes.camera(180, 240, fov=100, off_centre=(0.1, 0.9)),
     ),
@@ -101,7 +101,7 @@ def test_wipe_shows_both_sides(show, save):
     """The base, or the same file without its dial, which is then on at the left; by a switch, and
     by C.
     """
-    gaussians = dialled(600, 0, 7)
+    gaussians = attenuated(600, 0, 7)
     base = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
     shown = show(save(gaussians), "--base", save(base, "base.ply"), "--sv", 3, viewport=TALL)
     left = render(gaussians, VIEW, 3.0).pixels.numpy()

@@ -147,7 +147,7 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     second = gaussians.replace(
         sh0=-gaussians.sh0, attenuation=replace(gaussians.attenuation, max_sv=2.0)
     )
-    models = {"a.ply": gaussians, "b.glb": second, "c.ply": scenes.dialled(9, 1, 5)}
+    models = {"a.ply": gaussians, "b.glb": second, "c.ply": scenes.attenuated(9, 1, 5)}
     for name, model in models.items():
         write(tmp_path / name, model)
     photographed(tmp_path, ring(3, 320, 240))

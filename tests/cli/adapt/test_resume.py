@@ -232,7 +232,7 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     [(fail, [STATE]), (lambda found: replace(found, loss=math.nan), sorted([*OUTPUTS, STATE]))],
     ids=["step", "loss"],
 )
-def test_resuming_after_an_error(clod, dialled, tmp_path, change, files):
+def test_resuming_after_an_error(clod, attenuated, tmp_path, change, files):
     """The same command with --resume then writes the files of a run without an error."""
     with pytest.MonkeyPatch.context() as patch:
         change_step(patch, 6, change)
@@ -246,4 +246,4 @@ def test_resuming_after_an_error(clod, dialled, tmp_path, change, files):
         assert report["interrupted"] and report["steps"] == 5 and len(report["rows"]) > 2
         assert done.note("the result so far is written: the loss of step 6 is not finite")
     assert f"resuming {STATE} from step 5" in clod(ADAPT, "--resume").err
-    assert names(tmp_path) == OUTPUTS and results(tmp_path) == results(dialled.parent)
+    assert names(tmp_path) == OUTPUTS and results(tmp_path) == results(attenuated.parent)

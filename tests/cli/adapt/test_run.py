@@ -37,7 +37,7 @@ def adapted(run_in, tmp_path_factory):
     return folder, done
 
 
-def test_writes_three_files(adapted, capture, dialled):
+def test_writes_three_files(adapted, capture, attenuated):
     """The same seed gives the same bits. The report agrees with them at both ends of the dial and
     without it.
     """
@@ -72,7 +72,7 @@ def test_writes_three_files(adapted, capture, dialled):
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
     assert columns(folder / "dial.ply")[-3:] == ["sigma_d", "growth_d", "opacity_d"]
     assert b"screen_filter" not in data
-    assert results(folder) == results(dialled.parent)
+    assert results(folder) == results(attenuated.parent)
     model = load(folder / "dial.ply")
     views = load_scene(capture.scene).test
     measured = evaluate(detach(model.gaussians), views, [1.0])
@@ -128,15 +128,15 @@ def test_forecast_of_time_and_memory(clod):
     assert found["bytes"] == pytest.approx(found["actual_bytes"], rel=1 / 3)
 
 
-def test_dial_of_the_checkpoint_is_continued(clod, dialled):
+def test_dial_of_the_checkpoint_is_continued(clod, attenuated):
     """Its growth is dropped with --growth off, which a note says; a dial without growth starts with
     exponents of 0.
     """
     line = "--images SCENE --device cpu --max-sv 4 --out dial.ply --json --quiet --iters 0"
     dropped = "sigma_d; its growth_d is dropped, as growth is off"
     for model, more, note, stored in (
-        (dialled, "", "sigma_d and growth_d", ["sigma_d", "growth_d", "opacity_d"]),
-        (dialled, "--growth off", dropped, ["sigma_d", "opacity_d"]),
+        (attenuated, "", "sigma_d and growth_d", ["sigma_d", "growth_d", "opacity_d"]),
+        (attenuated, "--growth off", dropped, ["sigma_d", "opacity_d"]),
         ("off.ply", "", "sigma_d", ["sigma_d", "growth_d", "opacity_d"]),
     ):
         done = clod(model, line, more)
@@ -168,7 +168,7 @@ def test_without_photographs(clod, tmp_path, monkeypatch):
     done = clod("BASE", TINY, "--json")
     report = done.report
     assert report["scene"] is None
-    assert report["teacher"] == "checkpoint"
+    assert report["supervision"] == "checkpoint"
     assert report["seconds"]["place"] > 0
     (note,) = report["notes"]
     assert note in done.err
