@@ -28,7 +28,7 @@ ORDER = [
     {"bake", "harmonics", "initialization"},
     {"io.atomic", "io.settings"},
     {"io.file_formats", "io.ranks", "io.values"},
-    {"io.ply_layout", "io.ply_packed", "io.scene", "io.tensor_file"},
+    {"io.ply_layout", "io.scene", "io.tensor_file"},
     {"io.ply"},
     {"io.checkpoint", "io.formats"},
     {"io.adapter_file"},

@@ -18,7 +18,6 @@ from clod_adapter.inspection.statistics import FAR, Dial, Splat, Spread, values_
 from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, Head
 from clod_adapter.io.ply_layout import COLUMN, PREFIX, RGB, column_map, inria_dtype, is_coloured
-from clod_adapter.io.ply_packed import is_packed
 from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
 from clod_adapter.io.values import FILTER_3D, choice_of, dial_columns, in_question, prepared
 
@@ -102,9 +101,7 @@ def inspect(path: str | Path) -> Inspection:
         )
         order = "little" if head.ply.byte_order in "<=" else "big"
         encoding = "ascii" if head.ply.text else f"binary {order}-endian"
-    extra: tuple[str, ...] = ()
-    if not head or not is_packed(head.ply):
-        extra = extra_columns([name for name, _ in columns], degree)
+    extra = extra_columns([name for name, _ in columns], degree)
     splat = Splat(
         **values,
         sh_degree=degree,
@@ -145,8 +142,6 @@ def looks_like(head: Head) -> str | None:
         for comment in head.comments:
             if match := re.fullmatch(pattern, comment.strip()):
                 return who.format(*match.groups())
-    if is_packed(head.ply):
-        return "gsplat's exporter, or a tool of PlayCanvas"
     names = [p.name for p in head.ply["vertex"].properties] if "vertex" in head.ply else []
     if set(MASK_COLUMNS) <= set(names):
         return "MaskGaussian's trainer, an early version"

@@ -42,6 +42,7 @@ class Format(NamedTuple):
     ordered: bool = True  # whether the rows keep their order
 
 
+PACKED = ".compressed.ply"
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
 _GLB = "float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
 _SPZ = ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",)
@@ -59,6 +60,7 @@ FORMATS = {
         about=("exact; layout of gsplat's trainer",),
     ),
     ".splat": Format("formats.splat", about=("8 bits, SH degree 0",), ordered=False),
+    PACKED: _CONVERTED,
     ".sog": _CONVERTED,
     ".ksplat": _CONVERTED,
 }
@@ -69,6 +71,8 @@ def format_of(path: Path) -> Format:
     """The format of a file, by its name alone, so that only a .pt is unpickled; any other name is a
     PLY's.
     """
+    if path.name.lower().endswith(PACKED):
+        return FORMATS[PACKED]
     return FORMATS.get(path.suffix.lower(), PLY)
 
 
@@ -86,7 +90,7 @@ def file_has_dial(path: Path) -> bool:
 
 def check_suffix(path: Path) -> None:
     """Rejects a name whose suffix is none of WRITABLE."""
-    if path.name.lower().endswith((".sog", ".compressed.ply")):
+    if path.name.lower().endswith((".sog", PACKED)):
         raise ClodError(
             f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it"
         )

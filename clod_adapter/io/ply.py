@@ -1,6 +1,6 @@
 """PLY files of Gaussians, by plyfile: headers, and reading.
 
-Any property order, byte order or ascii; plain, or PlayCanvas's compressed layout (``ply_packed``).
+Any property order, byte order or ascii.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io import file_formats
 from clod_adapter.io.ply_layout import RGB, column_map, is_coloured, ply_metadata, with_harmonics
 from clod_adapter.io.ply_layout import write as write
-from clod_adapter.io.ply_packed import NOTE, check_packed, column_types, is_packed, unpack
 from clod_adapter.io.settings import Source, of_another_method
 from clod_adapter.io.values import (
     FILTER_3D,
@@ -122,11 +121,6 @@ def read(path: Path, data: bytes) -> Source:
     _check_length(path, head, len(data))
     with rejected_if_damaged(path):
         elements = _elements(data, head)
-    if is_packed(head.ply):
-        metadata = ply_metadata(path, head.comments, dial=False)
-        return Source(
-            unpack(path, elements, degree), metadata, (*head.notes, NOTE), head.comments, head=head
-        )
     rows = elements["vertex"]
     notes = [*head.notes, *of_another_method(rows.dtype.names or ())]
     if is_coloured(rows.dtype.names or ()):
@@ -220,12 +214,18 @@ def _check_length(path: Path, head: Head, length: int) -> None:
         )
 
 
+def column_types(element: PlyElement) -> dict[str, str]:
+    """The types of the properties by name; "list" of a list."""
+    types = {}
+    for column in element.properties:
+        types[column.name] = "list" if isinstance(column, PlyListProperty) else column.val_dtype
+    return types
+
+
 def sh_degree_of(path: Path, header: PlyData) -> int:
     """The SH degree of a checkpoint with this header; rejects something else, and missing
     columns.
     """
-    if is_packed(header):
-        return check_packed(path, header)
     if "vertex" not in header:
         names = ", ".join(element.name for element in header) or "none"
         raise ClodError(
@@ -233,6 +233,11 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
             " layout"
         )
     types = column_types(header["vertex"])
+    if any(name.startswith("packed_") for name in types):
+        raise ClodError(
+            f"{path}: is a compressed PLY; call it {path.stem}.compressed.ply, as which it is read"
+            " through splat-transform"
+        )
     anchors = [name for name in types if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)]
     if anchors:
         raise ClodError(

@@ -2,23 +2,18 @@
 
 import gzip
 import re
-import shutil
 import zipfile
-from pathlib import Path
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.lib.recfunctions import repack_fields
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 from refusals import refused
 from torch.testing import assert_close
 
-import scenes
 from clod_adapter.adapter import detach, extract
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
@@ -34,13 +29,14 @@ from formats import (
     examples,
     model,
     rows_by_place,
+    splat_transform,
     turned,
     write_elements,
 )
 
 ABOUT = "made in a test", "of two lines"
 DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
-KINDS = (*WRITABLE, ".ascii.ply", ".big.ply", ".compressed.ply", ".adapter.safetensors")
+KINDS = (*WRITABLE, ".ascii.ply", ".big.ply", ".adapter.safetensors")
 
 
 def of(suffix, degree=1, count=40):
@@ -70,8 +66,6 @@ LOSSES = {
 
 def any_file(folder, kind):
     path, g = folder / f"a{kind}", of(kind, 0, 5) if kind in WRITABLE else model(0, 5)
-    if kind == ".compressed.ply":
-        return Path(shutil.copy(PACKED, path))
     if kind == ".adapter.safetensors":
         save_adapter(path, extract(detach(g), g, fingerprint="ab", config={"steps": 3}))
         return path
@@ -115,26 +109,13 @@ def test_files_of_splat_transform(capture, kind):
     """Files of version 3.7: a .glb in glTF's axes under a node without a rotation; an .spz of
     version 3; two blocks.
     """
+    if "compressed" in kind:
+        splat_transform("--version")
     found = load(PACKED.with_name(f"capture{kind.split()[0]}"))
     rows = rows_by_place(capture.gaussians.means.numpy(), found.gaussians.means.numpy())
     same(kind, capture.gaussians, found.gaussians[torch.from_numpy(rows)])
     assert found.gaussians.opacity_logits.isfinite().all() and not any(found.origin)
     assert any("quantised" in note for note in found.notes) == (".glb" not in kind)
-
-
-def test_an_older_compressed_ply(tmp_path):
-    """A file of SH degree 0; its colours are in [0, 1] and have no ranges."""
-    now = load(PACKED).gaussians
-    chunks, vertex, _ = PlyData.read(str(PACKED), mmap=False).elements
-    older = chunks.data[[name for name in chunks.data.dtype.names if name[4:] not in "rgb"]]
-    write_elements(tmp_path / "a.ply", [PlyElement.describe(repack_fields(older), "chunk"), vertex])
-    found = load(tmp_path / "a.ply").gaussians
-    for k, name in enumerate("rgb"):
-        ranges = (chunks.data[f"{end}_{name}"].repeat(256) for end in ("min", "max"))
-        low, high = (torch.from_numpy(values[: len(now)]) for values in ranges)
-        share = 0.5 + SH_C0 * found.sh0[:, 0, k]
-        assert_close(share * (high - low) + low, 0.5 + SH_C0 * now.sh0[:, 0, k])
-    scenes.assert_equal(found.replace(sh0=now.sh0, shN=now.shN), now)
 
 
 @pytest.mark.parametrize("suffix", DIAL)

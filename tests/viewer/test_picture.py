@@ -169,6 +169,7 @@ def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, 
     rows = PlyData.read(model, mmap=False)
     rows.text = True
     rows.write(tmp_path / "ascii.ply")
+    splat_transform("--version")
     shutil.copy(PACKED, tmp_path)
     folder = tmp_path / "temporary"
     folder.mkdir()
