@@ -60,12 +60,6 @@ SHOWN = {  # in the table: the dial, settings, PSNR of the pictures, readers
             "Spark 2.2), without the dial"
         ),
     ),
-    ".safetensors": (
-        "tensors `sigma_d`, `growth_d`, float32",
-        "metadata",
-        "",
-        "the safetensors library; no viewer",
-    ),
     ".pt": (
         'tensors `splats["sigma_d"]`, `splats["growth_d"]`, float32',
         "string `clod_adapter`",

@@ -52,7 +52,6 @@ FORMATS = {
     ".ply": PLY,
     ".glb": Format("formats.glb", carries_sigma=True, about=_GLB),
     ".spz": Format("formats.spz", carries_sigma=True, about=_SPZ),
-    ".safetensors": Format("tensor_file", carries_sigma=True, about=("exact; for Python",)),
     ".pt": Format(
         "formats.pt",
         "formats.pt.check",
@@ -194,11 +193,6 @@ def check_start(path: Path) -> None:
         reject(
             path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again"
         )
-    header = _call("tensor_file.read_tensor_header", path)[1] if suffix == ".safetensors" else {}
-    if '"clod-adapter"' in header.get(KEY, ""):
-        raise ClodError(
-            f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply"
-        )
 
 
 def _call(function: str, *args: Any) -> Any:
@@ -239,6 +233,10 @@ OTHERS: dict[str | bytes, tuple[str, str]] = {
     ".pth": (
         "a trainer's checkpoint, such as Inria's",
         "use the point_cloud/iteration_N/point_cloud.ply beside it",
+    ),
+    ".safetensors": (
+        "no model but perhaps an adapter",
+        "clod-adapt apply BASE.ply ADAPTER.safetensors -o OUT.ply makes a model of it",
     ),
     ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
     b"\x1f\x8b": ("compressed with gzip", "unpack it first: gunzip"),

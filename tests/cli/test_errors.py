@@ -48,6 +48,7 @@ def folder(capture, dialled, tmp_path_factory):
     for suffix in WRITABLE:
         write(there / f"bare{suffix}", bare if FORMATS[suffix].carries_sigma else capture.gaussians)
     (there / "text.ply").write_text("hello")
+    (there / "dial.html").write_text("<title>dial, adaptation report</title>")
     (there / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
     (there / "mesh.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
@@ -230,7 +231,11 @@ ERRORS = [
         "out/cells/base_base.json~base.ply",
     ),
     # Files of adapting beside the input, which are named for something else.
-    ("export link.ply -o dial.safetensors", f"dial.safetensors: {BESIDE}", "link.ply>dial.ply"),
+    (
+        "export link.ply -o dial.html",
+        f"dial.html: {BESIDE}",
+        "link.ply>dial.ply",
+    ),
     # Names that follow from others, where a file is that another program wrote.
     (f"base.ply {TINY} -o out.ply", f"out.json: {FOREIGN}", "out.json"),
     (f"base.ply {TINY} --report -o out.ply", f"out_rendering.png: {FOREIGN}", "out_rendering.png"),
@@ -268,7 +273,7 @@ def outputs_of(line):
 @pytest.mark.parametrize(
     "first, second, said",
     [
-        (f"base.ply {TINY} -o two.ply", "export dial.ply -o two.safetensors", "two.safetensors"),
+        (f"base.ply {TINY} -o two.ply", "export dial.ply -o two.ply", "two.ply"),
         (
             f"base.ply {TINY} -o two.ply --report",
             "eval dial.ply --images scene --report two.html",
@@ -296,7 +301,7 @@ def test_earlier_outputs_are_replaced(clod, dialled, tmp_path):
     (tmp_path / "out.ply").write_bytes(b"foreign, but named")
     twice = (
         "render DIAL --images SCENE -o pictures",
-        "export DIAL -o x.safetensors",
+        "export DIAL -o x.pt",
         "export DIAL -o x.spz --levels 1,2",
     )
     for line in ("BASE --images SCENE --iters 2 --max-sv 2 -o out.ply", *twice, *twice):

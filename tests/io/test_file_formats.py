@@ -222,7 +222,7 @@ def test_damage_raises_only_clod_error(tmp_path, kind, data, inside):
 def test_adapter_is_refused_as_model(tmp_path):
     path = any_file(tmp_path, ".adapter.safetensors")
     for opened in (check_readable, load):
-        with refused(f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply"):
+        with refused(f"{path}: is no model but perhaps an adapter; clod-adapt apply BASE.ply"):
             opened(path)
 
 
@@ -270,10 +270,8 @@ def test_what_cannot_be_read_again_is_not_written(tmp_path):
 
 
 def test_text_is_made_ascii_and_infinite_opacity_finite(tmp_path):
-    write(
-        tmp_path / "a.safetensors", model(0), Metadata(about=("caf\u00e9", "clod_adapter max_sv 2"))
-    )
-    found = load(tmp_path / "a.safetensors")
+    write(tmp_path / "a.pt", model(0), Metadata(about=("caf\u00e9", "clod_adapter max_sv 2")))
+    found = load(tmp_path / "a.pt")
     assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
     (note,) = write(tmp_path / "a.ply", model())
     assert note == "1 opacities of +inf are written as 20, which is 1 too"

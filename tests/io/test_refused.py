@@ -18,7 +18,6 @@ import pytest
 import torch
 from plyfile import PlyElement
 from refusals import refused
-from safetensors.torch import save_file
 
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import FORMATS, check_readable, write
@@ -31,7 +30,6 @@ from formats import (
     write_elements,
     write_rows,
 )
-from scenes import gaussians
 
 # its own errors: test_splat_transform.py
 pytestmark = pytest.mark.usefixtures("without_splat_transform")
@@ -100,22 +98,6 @@ def with_record(columns, values):
     return make
 
 
-def tensors(metadata=None, **changes):
-    """A .safetensors of five Gaussians with some tensors changed or left out."""
-    about = {
-        "clod_adapter": json.dumps(
-            {"format": "clod-model", "format_version": 1, "package_version": "0"}
-        )
-    }
-
-    def make(path):
-        values = gaussians(5, 1, 0).tensors() | changes
-        kept = {name: tensor for name, tensor in values.items() if tensor is not None}
-        save_file(kept, path, about if metadata is None else metadata)
-
-    return make
-
-
 def splats(count=12, **changes):
     shapes = {
         "means": (count, 3),
@@ -179,7 +161,7 @@ OTHER_KINDS = (
     ("a.pt", bytes(64), "no file of torch.save"),
     ("a.splat", bytes(63), "not a .splat file, whose rows have 32"),
     ("a.splat", b"ply\n" + bytes(60), "is a PLY file; call it .ply"),
-    ("a.safetensors", bytes(64), "not a safetensors file, or damaged"),
+    ("a.safetensors", bytes(64), "perhaps an adapter; clod-adapt apply"),
     ("a.lcc", bytes(64), "LCC.*splat-transform IN.lcc OUT.ply"),
     ("a.hier", bytes(64), "Hierarchical-3DGS.*point_cloud.ply"),
     ("a.ckpt", b"PK\x03\x04rest", "Nerfstudio.*ns-export gaussian-splat"),
@@ -274,13 +256,6 @@ OF_SPZ = (
         )
     ),
 )
-OF_SAFETENSORS = (
-    (tensors(means=torch.ones(4, 3)), "quats has shape"),
-    (tensors(shN=torch.ones(5, 2, 3)), "shN has 2 coefficients"),
-    (tensors(quats=torch.ones(5, 4, dtype=torch.int32)), "not of floating-point"),
-    (tensors(quats=None), "has no tensor 'quats'"),
-    (tensors({}), "not a model of clod-adapter"),
-)
 OF_PT = (
     ([1], "no dictionary 'splats'.*list"),
     ({"model": 1}, "no dictionary 'splats'.*'model'"),
@@ -312,7 +287,6 @@ REFUSED = (
     *(("in.ply", *each) for each in OF_PLY),
     *(("a.glb", glb(change), message) for change, message in OF_GLB),
     *(("a.spz", *each) for each in OF_SPZ),
-    *(("a.safetensors", *each) for each in OF_SAFETENSORS),
     *(("a.pt", partial(torch.save, checkpoint), message) for checkpoint, message in OF_PT),
     ("packed.pt", archive(zipfile.ZIP_DEFLATED, 0), "torch.save does not write"),
     ("many.pt", archive(zipfile.ZIP_STORED, 100), "torch.save does not write"),

@@ -162,7 +162,6 @@ def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, 
     for name, saved in (
         ("a b&.glb", gaussians),
         ("a.splat", plain),
-        ("a.safetensors", gaussians),
         ("a.pt", plain),
     ):
         write(tmp_path / name, finer(saved, 2.0))
