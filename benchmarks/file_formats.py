@@ -66,12 +66,6 @@ SHOWN = {  # in the table: the dial, settings, PSNR of the pictures, readers
         "",
         "gsplat's trainer and viewer",
     ),
-    ".splat": (
-        "none: one dial value, baked",
-        "none",
-        "{both} dB against the baked PLY",
-        "most web viewers (Spark 2.2), splat-transform",
-    ),
 }
 
 

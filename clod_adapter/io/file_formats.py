@@ -58,9 +58,9 @@ FORMATS = {
         carries_sigma=True,
         about=("exact; layout of gsplat's trainer",),
     ),
-    ".splat": Format("formats.splat", about=("8 bits, SH degree 0",), ordered=False),
     PACKED: _CONVERTED,
     ".sog": _CONVERTED,
+    ".splat": _CONVERTED,
     ".ksplat": _CONVERTED,
 }
 WRITABLE = tuple(suffix for suffix, form in FORMATS.items() if form.about)
@@ -156,10 +156,6 @@ def write(
         raise ClodError(
             f"{path}: there are no Gaussians to write, and no reader takes a file without any"
         )
-    if gaussians.sigma_d is not None and not form.carries_sigma:
-        raise ClodError(
-            f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake"
-        )
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
 
     g = in_world_units(gaussians)
@@ -188,11 +184,6 @@ def check_start(path: Path) -> None:
         reject(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
         _call("formats.splat_transform.check", path)
-    # a .splat has no header: other files are known by their size, and a PLY by its first bytes
-    if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):
-        reject(
-            path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again"
-        )
 
 
 def _call(function: str, *args: Any) -> Any:

@@ -18,7 +18,7 @@ from PIL import Image
 import clod_adapter
 from clod_adapter.cli.main import COMMANDS, build_parser, command_of
 from clod_adapter.cli.shared.outputs import claimed
-from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
+from clod_adapter.io.file_formats import WRITABLE, write
 from runs import contents
 
 
@@ -46,7 +46,7 @@ def folder(capture, dialled, tmp_path_factory):
         shutil.copy(dialled.with_suffix(suffix), there / f"dial{suffix}")
     bare = clod_adapter.with_dial(capture.gaussians)
     for suffix in WRITABLE:
-        write(there / f"bare{suffix}", bare if FORMATS[suffix].carries_sigma else capture.gaussians)
+        write(there / f"bare{suffix}", bare)
     (there / "text.ply").write_text("hello")
     (there / "dial.html").write_text("<title>dial, adaptation report</title>")
     (there / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
@@ -149,12 +149,12 @@ ERRORS = [
     ],
     ("export bare.ply -o x", "x: --out must end in one of .ply, .*, which is the format"),
     (
-        "export bare.ply -o x.splat",
-        "x.splat: .splat cannot store a dial; choose a dial value .* format .*.ply",
+        "export bare.ply -o x.sog",
+        "x.sog: .sog cannot store a dial; choose a dial value .* format .*.ply",
     ),
     (
-        "export bare.ply -o x.splat --sv 2 --order extinction",
-        "x.splat: .splat sorts the Gaussians itself",
+        "export bare.ply -o x.sog --sv 2 --order extinction",
+        "x.sog: .sog sorts the Gaussians itself",
     ),
     ("export bare.ply -o x.ply --sv 2 --levels 1,2", "--levels: not allowed with argument --sv"),
     (

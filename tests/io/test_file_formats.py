@@ -17,7 +17,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, write
+from clod_adapter.io.file_formats import WRITABLE, check_readable, file_has_dial, write
 from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import NOWHERE
 from formats import (
@@ -35,12 +35,7 @@ from formats import (
 )
 
 ABOUT = "made in a test", "of two lines"
-DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
 KINDS = (*WRITABLE, ".ascii.ply", ".big.ply", ".adapter.safetensors")
-
-
-def of(suffix, degree=1, count=40):
-    return model(degree, count) if suffix in DIAL else detach(model(degree, count))
 
 
 # Largest differences of positions, log scales, opacities, sh0, shN and sigma_d, and the largest
@@ -65,7 +60,7 @@ LOSSES = {
 
 
 def any_file(folder, kind):
-    path, g = folder / f"a{kind}", of(kind, 0, 5) if kind in WRITABLE else model(0, 5)
+    path, g = folder / f"a{kind}", model(0, 5)
     if kind == ".adapter.safetensors":
         save_adapter(path, extract(detach(g), g, fingerprint="ab", config={"steps": 3}))
         return path
@@ -118,13 +113,13 @@ def test_files_of_splat_transform(capture, kind):
     assert any("quantised" in note for note in found.notes) == (".glb" not in kind)
 
 
-@pytest.mark.parametrize("suffix", DIAL)
+@pytest.mark.parametrize("suffix", WRITABLE)
 @pytest.mark.parametrize(
     ("turn", "far", "growth"), [(0, False, False), (2, True, True), (4, False, True)]
 )
 def test_dial_round_trips(tmp_path, suffix, turn, far, growth):
     """Each SH degree occurs with one format or another."""
-    degree = (DIAL.index(suffix) + turn) % 5
+    degree = (WRITABLE.index(suffix) + turn) % 5
     g, origin = model(degree, growth=growth), ORIGIN if far else NOWHERE
     path = tmp_path / f"a{suffix.upper()}"
     notes = write(path, g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
@@ -166,7 +161,7 @@ def test_model_without_dial_round_trips(tmp_path, suffix):
     rows = torch.from_numpy(rows_by_place(g.means.numpy(), found.gaussians.means.numpy()))
     assert found.gaussians.sigma_d is None
     assert (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
-    assert any("quantised" in note for note in found.notes) == (suffix in (".spz", ".splat"))
+    assert any("quantised" in note for note in found.notes) == (suffix == ".spz")
     seen = inspect(path)
     assert seen.splat.dial is None
     assert seen.what.endswith(suffix if suffix != ".ply" else "PLY")
@@ -180,10 +175,8 @@ def test_refused_write_leaves_no_file(tmp_path, suffix):
         (plain.replace(sh0=plain.sh0 * torch.nan), "a value is not finite; drop such rows"),
         (plain.replace(quats=plain.quats * 0), "rotation is zero"),
     ]
-    if suffix in (".glb", ".splat"):
+    if suffix == ".glb":
         unfit.append((plain.replace(log_scales=torch.full((40, 3), 90.0)), "a scale is beyond"))
-    if suffix not in DIAL:
-        unfit.append((model(), "no room for a dial; choose a dial value to bake"))
     for g, message in unfit:
         with refused(f"a{suffix}: .*{message}"):
             write(tmp_path / f"a{suffix}", g)
@@ -258,7 +251,7 @@ def test_long_history_is_cut(tmp_path):
         )
     for path in tmp_path.glob("[bc].*"):
         again = load(path)
-        assert again.comments == (() if path.suffix == ".splat" else found.comments), path
+        assert again.comments == found.comments, path
         assert not any("not carried over" in note for note in again.notes)
 
 

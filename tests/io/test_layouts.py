@@ -35,7 +35,6 @@ from formats import (
     inria_rows,
     model,
     resaved,
-    rows_by_place,
     splat_transform,
     turned,
     write_rows,
@@ -312,29 +311,6 @@ def test_far_positions_of_an_spz(tmp_path):
     for s in (1.0, 6.0):  # the angle that it covers
         size, close = (grown(x, s) - x.means.norm(dim=1).log()[:, None] for x in (far, again))
         assert (close - size)[9].abs().max() <= 0.04
-
-
-def test_losses_of_a_splat(tmp_path):
-    """The bytes of a row, and the order of a file, where the largest come first."""
-    g = detach(model(0)).select(torch.arange(1))
-    assert len(write(tmp_path / "a.splat", g)) == 1
-    data = (tmp_path / "a.splat").read_bytes()
-    assert len(data) == 32
-    floats, levels = np.frombuffer(data[:24], "<f4"), np.frombuffer(data[24:], np.uint8)
-    assert_array_equal(floats[:3], g.means[0])
-    assert_allclose(floats[3:], g.scales[0], rtol=1e-6)
-    color = (0.5 + SH_C0 * g.sh0[0, 0]).clamp(0, 1) * 255
-    assert_array_equal(levels[:4], [*color.round().int(), 255])
-    quat = g.quats[0] / g.quats[0].norm()
-    assert_array_equal(levels[4:], (quat * 128 + 128).round().clamp(max=255))
-    g = detach(model(1, 300))
-    notes = write(tmp_path / "a.splat", g, Metadata(origin=ORIGIN))
-    assert "8 bits" in notes[0] and "view-dependent" in notes[1] and "origin" in notes[2]
-    again = load(tmp_path / "a.splat").gaussians
-    rows = rows_by_place(again.means.numpy(), g.means.numpy())
-    weights = (g.scales.prod(1) * g.opacities)[rows]
-    assert turned(again.quats, g.quats[rows]) < 0.02
-    assert (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
 
 
 @pytest.mark.parametrize("degree", [0, 3])

@@ -159,8 +159,6 @@ OTHER_KINDS = (
     ("a.spz", b"glTF", "a glTF model; call it .glb"),
     ("a.glb", b"ply\nformat ascii 1.0\n", "a PLY file; call it .ply"),
     ("a.pt", bytes(64), "no file of torch.save"),
-    ("a.splat", bytes(63), "not a .splat file, whose rows have 32"),
-    ("a.splat", b"ply\n" + bytes(60), "is a PLY file; call it .ply"),
     ("a.safetensors", bytes(64), "perhaps an adapter; clod-adapt apply"),
     ("a.lcc", bytes(64), "LCC.*splat-transform IN.lcc OUT.ply"),
     ("a.hier", bytes(64), "Hierarchical-3DGS.*point_cloud.ply"),

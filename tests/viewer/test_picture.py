@@ -161,8 +161,8 @@ def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, 
     """They are shown as ``clod-adapt view`` shows them; none remains; errors are one line."""
     for name, saved in (
         ("a b&.glb", gaussians),
-        ("a.splat", plain),
         ("a.pt", plain),
+        ("b.spz", plain),
     ):
         write(tmp_path / name, finer(saved, 2.0))
     rows = PlyData.read(model, mmap=False)
