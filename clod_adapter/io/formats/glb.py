@@ -219,7 +219,7 @@ def read(path: Path, data: bytes) -> Source:
         arrays["shN"] = np.stack(coefficients, 1)
     stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
-    stored = stored if turned else half_turn(stored, "z")
+    stored = stored if turned else half_turn(stored)
     if scale != 1:
         if SIGMA in arrays:
             raise ClodError(f"{path}: its node scales a dial by {scale:g}; take the scale away")

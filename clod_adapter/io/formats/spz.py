@@ -42,15 +42,7 @@ from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ, START, read_bytes
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import DAMAGED, MODEL, TAG, Metadata, Source, document, parse_metadata
-from clod_adapter.io.values import (
-    GROWTH,
-    OPACITY,
-    SIGMA,
-    arrays_of,
-    bytes_of,
-    dial_columns,
-    half_turn,
-)
+from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, bytes_of, dial_columns
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC = 0x5053474E
@@ -75,7 +67,6 @@ QUANTISED = (
 )
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
-_TURNS = {RDF: "", 4: "x", 7: "z"}  # right, up, back; left, up, forward
 _SMALL = 1 << 24  # bytes that any file may
 
 
@@ -205,20 +196,22 @@ def has_dial(path: Path) -> bool:
 
 
 def read(path: Path, data: bytes) -> Source:
-    """Reads versions 2 and 3, SH degree 0 to 4; version 4 is converted by splat-transform."""
+    """Reads version 3, SH degree 0 to 4; versions 2 and 4 are converted by splat-transform."""
     if data.startswith(NEW_SPZ):
         return splat_transform.read(path, data)
+    packed = data
     data = _unpacked(path, data)
-    magic, version, count = struct.unpack_from("<III", data)
-    degree, bits, flags = data[12:15]
-    readable = magic == MAGIC and version in (2, 3)
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
+    if magic == MAGIC and version == 2:
+        return splat_transform.read(path, packed)
+    readable = magic == MAGIC and version == VERSION
     if not readable or degree not in SH_COUNTS or bits > 24 or count > MOST_GAUSSIANS:
         raise ClodError(
-            f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians);"
+            f"{path}: is no SPZ file of version 3 (version {version}, {count} Gaussians);"
             f" {_CONVERT}"
         )
     bands = SH_COUNTS[degree] - 1
-    sizes = 9, 1, 3, 3, 4 if version == 3 else 3, 3 * bands
+    sizes = 9, 1, 3, 3, 4, 3 * bands
     end = HEADER.size + count * sum(sizes)
     if not count or end > len(data):
         raise ClodError(f"{path}: has no Gaussians or is truncated; copy or export it again")
@@ -230,12 +223,11 @@ def read(path: Path, data: bytes) -> Source:
     metadata = parse_metadata(path, stored, dial=bool(dial))
     # the axes; a file without a record has those that converters write
     axes = int.from_bytes(records.get(AXES, bytes([RDF])), "little")
-    if axes not in _TURNS:
+    if axes != RDF:
         raise ClodError(
             f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}"
         )
-    arrays = _unquantized(columns, bits)
-    arrays = (half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays) | dial
+    arrays = _unquantized(columns, bits) | dial
     if dial:  # whose sigma_d is in units of the reference distance where that is large
         tensors: dict[str, Any] = {
             name: torch.from_numpy(array).float()
@@ -297,11 +289,13 @@ def _unquantized(columns: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
     wide = np.zeros((len(means), 3, 4), np.uint8)
     wide[..., 1:] = means.reshape(-1, 3, 3)
     fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
+    # so that logits are finite: the first and last level are a quarter of a level from 0 and 1
+    shares = opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255
     return {
         "means": (fixed / 2.0**bits).astype(np.float32),
         "quats": _rotations(quats),
         "log_scales": scales.astype(np.float32) / 16 - 10,
-        "opacity_logits": values.logits_of_bytes(opacities[:, 0]),
+        "opacity_logits": values.logit(shares),
         "sh0": ((colors.astype(np.float32) / 255 - 0.5) / COLOR)[:, None],
         "shN": (harmonics.reshape(len(means), -1, 3).astype(np.float32) - 128) / 128,
     }
@@ -309,10 +303,6 @@ def _unquantized(columns: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
     """``[N, 4]`` wxyz; the inverse of ``_packed_quats``."""
-    if quats.shape[1] == 3:  # version 2: w is not stored, and at least 0
-        xyz = quats / 127.5 - 1
-        w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True)))
-        return np.concatenate([w, xyz], 1)
     packed = np.ascontiguousarray(quats).view("<u4")[:, 0]
     largest = packed >> 30
     xyzw = np.zeros((len(packed), 4), np.float64)
