@@ -17,7 +17,7 @@ from clod_adapter.config import SH_COUNTS
 from clod_adapter.inspection.statistics import FAR, Dial, Splat, Spread, values_of
 from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, Head
-from clod_adapter.io.ply_layout import COLUMN, PREFIX, RGB, column_map, inria_dtype, is_coloured
+from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map, inria_dtype
 from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
 from clod_adapter.io.values import FILTER_3D, choice_of, dial_columns, in_question, prepared
 
@@ -168,7 +168,7 @@ def looks_like(head: Head) -> str | None:
 def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
     """The properties of a PLY without a meaning here."""
     with_meaning = {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER_3D}
-    with_meaning.update(*column_map(sh_degree).values(), RGB if is_coloured(names) else ())
+    with_meaning.update(*column_map(sh_degree).values())
     return tuple(name for name in names if name not in with_meaning and not name.startswith(COLUMN))
 
 

@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io import file_formats
-from clod_adapter.io.ply_layout import RGB, column_map, is_coloured, ply_metadata, with_harmonics
+from clod_adapter.io.ply_layout import column_map, ply_metadata
 from clod_adapter.io.ply_layout import write as write
 from clod_adapter.io.settings import Source, of_another_method
 from clod_adapter.io.values import (
@@ -39,10 +39,6 @@ _LONGEST = 1 << 20  # characters of a row of text
 _PREFIXED = rb"(?<=[\r\n])(property[ \t]+\w+[ \t]+)(?:scal(?:ar)?_)+"
 UNPREFIXED = (
     "saved by CloudCompare: its properties are read, and written, without the prefix scalar_"
-)
-COLOURED = (
-    "its colours are red, green, blue in 8 bits, read as SH degree 0; for all harmonics export it"
-    " again by ns-export gaussian-splat --ply-color-mode sh_coeffs"
 )
 
 
@@ -123,9 +119,6 @@ def read(path: Path, data: bytes) -> Source:
         elements = _elements(data, head)
     rows = elements["vertex"]
     notes = [*head.notes, *of_another_method(rows.dtype.names or ())]
-    if is_coloured(rows.dtype.names or ()):
-        rows = with_harmonics(rows)
-        notes.append(COLOURED)
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, head.comments, rows, dial=SIGMA in arrays)
     lost = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
@@ -255,8 +248,11 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
             f"{path}: has no property scale_2, so this is a 2DGS file of flat disks; use a 3DGS"
             " checkpoint"
         )
-    if is_coloured(types) and all(types[name] == "u1" for name in RGB):
-        types |= dict.fromkeys(column_map(0)["sh0"], "f4")
+    if "red" in types and "f_dc_0" not in types:
+        raise ClodError(
+            f"{path}: has colours in the place of f_dc_0, f_dc_1, f_dc_2; export it again by"
+            " ns-export gaussian-splat --ply-color-mode sh_coeffs"
+        )
     higher = [name for name in types if re.fullmatch(r"f_rest_\d+", name)]
     degree = degree_of(path, len(higher))
     for name in chain(*column_map(degree).values()):

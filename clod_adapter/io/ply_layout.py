@@ -8,7 +8,7 @@ columns in a constant float column too, whose name begins with ``clod_``, before
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, astuple, fields, replace
 from itertools import product
 from pathlib import Path
@@ -31,7 +31,6 @@ from clod_adapter.io.values import (
     arrays_of,
     dial_columns,
     hidden,
-    sh0_of,
 )
 
 if TYPE_CHECKING:
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
 
 PREFIX = "clod_adapter "
 COLUMN = "clod_"
-RGB = ("red", "green", "blue")
 # Comments of the calibration: machine; total, views, width, height, reference; one for each row and
 # each viewpoint.
 MACHINE = "calibrated_on"
@@ -73,27 +71,6 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
         "sh0": tuple(f"f_dc_{c}" for c in range(3)),
         "shN": tuple(f"f_rest_{c * bands + k}" for k, c in product(range(bands), range(3))),
     }
-
-
-def is_coloured(names: Container[str]) -> bool:
-    """Whether RGB stands for the harmonics, as ``ns-export gaussian-splat --ply-color-mode rgb``
-    writes it.
-    """
-    if "f_dc_0" in names or "f_rest_0" in names:
-        return False
-    return all(name in names for name in (*RGB, "scale_0"))
-
-
-def with_harmonics(rows: np.ndarray) -> np.ndarray:
-    """The rows with f_dc in the place of RGB."""
-    names = {
-        name: f"f_dc_{RGB.index(name)}" if name in RGB else name for name in rows.dtype.names or ()
-    }
-    kinds = [(new, "f4" if old in RGB else rows.dtype[old]) for old, new in names.items()]
-    harmonic_rows = np.empty(len(rows), kinds)
-    for old, new in names.items():
-        harmonic_rows[new] = sh0_of(rows[old]) if old in RGB else rows[old]
-    return harmonic_rows
 
 
 def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:

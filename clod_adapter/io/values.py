@@ -350,11 +350,6 @@ def colours_of(sh0: np.ndarray, opacities: np.ndarray) -> np.ndarray:
     return bytes_of(255 * np.concatenate([colours, opacities[:, None]], 1))
 
 
-def sh0_of(levels: np.ndarray) -> np.ndarray:
-    """Float32 harmonics of degree 0 of colours in 255ths."""
-    return (levels.astype(np.float32) / 255 - 0.5) / _SH_C0
-
-
 def bytes_of(values: np.ndarray) -> np.ndarray:
     """Levels of 0 to 255, rounded."""
     return np.clip(np.round(values), 0, 255).astype(np.uint8)

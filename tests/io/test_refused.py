@@ -170,6 +170,7 @@ OF_PLY = (
     (rows("packed_position", "packed_rotation"), "compressed PLY; call it in.compressed.ply"),
     (rows(*needed(1), "f_offset_0", "f_anchor_feat_0"), "Scaffold-GS"),
     (rows(without=("scale_2",)), "2DGS"),
+    (rows(*needed()[:3], "red", *needed()[6:]), "colours in the place.*--ply-color-mode"),
     (rows("x", "y", "z", "nx", "ny", "nz"), "mesh or a point cloud"),
     *((rows(without=(name,)), f"property {name} is missing") for name in ("rot_3", "y")),
     (rows(without=("f_rest_4",)), "8 f_rest"),
