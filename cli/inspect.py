@@ -183,7 +183,7 @@ FILE can be a PLY (also compressed), gsplat's .pt, an adapter or the state of an
 interrupted run (.safetensors), any format of clod-adapt export, and, with
 splat-transform installed, .sog or .ksplat.
 
-  looks like   a guess from comments and the order of properties
+  looks like   by comments of the file
   needle       a Gaussian more than 10 times as long as its second axis
 
 examples:

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.config import SH_COUNTS
 from clod_adapter.inspection.statistics import FAR, Dial, Splat, Spread, values_of
 from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, Head
-from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map, inria_dtype
+from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map
 from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
 from clod_adapter.io.values import FILTER_3D, choice_of, dial_columns, in_question, prepared
 
@@ -137,31 +136,11 @@ def inspect(path: str | Path) -> Inspection:
 
 
 def looks_like(head: Head) -> str | None:
-    """The program that probably wrote a PLY with this header; None where it is not a known one."""
+    """The program that wrote a PLY with this header, by its comments."""
     for pattern, who in COMMENTS:
         for comment in head.comments:
             if match := re.fullmatch(pattern, comment.strip()):
                 return who.format(*match.groups())
-    names = [p.name for p in head.ply["vertex"].properties] if "vertex" in head.ply else []
-    if set(MASK_COLUMNS) <= set(names):
-        return "MaskGaussian's trainer, an early version"
-    if FILTER_3D in names:
-        return "Mip-Splatting's trainer"
-    plain = [
-        name for name in names if name not in dial_columns(names) and not name.startswith(COLUMN)
-    ]
-    rest_count = sum(name.startswith("f_rest_") for name in names)
-    degree = next(
-        (degree for degree, count in SH_COUNTS.items() if 3 * (count - 1) == rest_count), 0
-    )
-    inria = list(inria_dtype(degree).names or ())
-    if plain == inria:
-        return "Inria's trainer, or one of the many that write its layout"
-    if plain == [name for name in inria if name not in NORMALS]:
-        return "gsplat's exporter, or another that writes Inria's layout without normals"
-    groups = column_map(degree)
-    if plain[:11] == [*groups["means"], *groups["quats"], *groups["log_scales"], "opacity"]:
-        return "splat-transform"
     return None
 
 

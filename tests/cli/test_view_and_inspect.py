@@ -111,8 +111,7 @@ def test_a_plain_file_fits_on_a_screen(clod, capture):
     lines = done.out.splitlines()
     assert len(lines) <= 24 and max(map(len, lines[1:])) <= 120 and done.err == ""
     assert lines[0].startswith(f"{capture.ply} (")
-    assert lines[2].startswith("looks like   Inria's trainer")
-    assert lines[3] == "Gaussians    300" and "dial         none: no sigma_d" in lines
+    assert lines[2] == "Gaussians    300" and "dial         none: no sigma_d" in lines
     titles = ["least", "1", "%", "median", "99", "%", "greatest"]
     at = next(k for k, line in enumerate(lines) if line.split() == titles)
     table = lines[at : at + 6]
