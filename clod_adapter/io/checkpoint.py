@@ -29,7 +29,6 @@ from clod_adapter.io.settings import (
     matching_calibration,
     stated_filter,
     tagged,
-    truncate_history,
 )
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
@@ -47,8 +46,7 @@ class Checkpoint:
             growth_d, if the file is extended.
         vertex: of a PLY, ``[N]`` structured array: the same rows with every column as it is in the
             file, native byte order; None for other formats.
-        comments: the header's but the settings, or the lines of history of another format; as far
-            as an output has room for them.
+        comments: the header's but the settings, or the lines of history of another format.
         notes: what was dropped or noticed, one line each.
         fingerprint: SHA-256 of the file's bytes, hex, or of those of all ranks; preceded by
             "opacity:", "scales:" or "both:" where values were taken as activated.
@@ -186,12 +184,11 @@ def load(
     about = [comment for comment in source.comments if not comment.startswith(PREFIX)]
     if source.head is None:
         about = tagged([re.sub("[^ -~]", "?", line) for line in about], screen_filter)
-    comments, cut = truncate_history([*about, *values.changes])
     return Checkpoint(
         gaussians,
         rows,
-        comments,
-        (*notes, *mismatch, *source.notes, *cut),
+        (*about, *values.changes),
+        (*notes, *mismatch, *source.notes),
         source.sha256 if values.activated == "none" else f"{values.activated}:{source.sha256}",
         path,
         calibration,

@@ -230,31 +230,6 @@ def test_truncation_is_refused(tmp_path, kind):
             read(path)
 
 
-def test_long_history_is_cut(tmp_path):
-    """Every format has room for what is left, the last lines first, so that the outputs can be
-    read.
-    """
-    lines = [*["x" * 1000] * 100, "y" * 70_000, *map(str, range(500)), "last"]
-    write(tmp_path / "plain.ply", detach(model(0)))
-    plain = PlyData.read(tmp_path / "plain.ply", mmap=False)
-    plain.comments = lines
-    plain.write(tmp_path / "a.ply")
-    found = load(tmp_path / "a.ply")
-    assert any("comments are not carried over to outputs" in note for note in found.notes)
-    assert found.comments[-1] == "last" and set(found.comments[:9]) == {"x" * 1000}
-    save(tmp_path / "b.ply", found.gaussians, found)
-    for suffix in WRITABLE:
-        write(
-            tmp_path / f"c{suffix}",
-            found.gaussians,
-            Metadata(calibration=CALIBRATION, about=found.comments),
-        )
-    for path in tmp_path.glob("[bc].*"):
-        again = load(path)
-        assert again.comments == found.comments, path
-        assert not any("not carried over" in note for note in again.notes)
-
-
 def test_what_cannot_be_read_again_is_not_written(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"earlier")
     with refused(f"^{tmp_path}/a.ply: is not written, because it could not be read again: "):
