@@ -33,7 +33,7 @@ ORDER = [
     {"io.checkpoint", "io.formats"},
     {"io.adapter_file"},
     {"alignment", "report", "training", "viewer"},
-    {"evaluation", "inspection", "nerfstudio"},
+    {"evaluation", "inspection"},
     {"pipeline"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from the rows above
