@@ -40,7 +40,7 @@ class Gaussians:
         log_scales: ``[N, 3]`` logarithms of the standard deviations along the axes, world units.
         opacity_logits: ``[N]``; the opacity is their sigmoid. +inf means fully opaque.
         sh0: ``[N, 1, 3]`` degree-0 spherical harmonics.
-        shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16, 25}.
+        shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16}.
         sigma_d: ``[N]`` reaches, the distances at which they end, or None for a checkpoint without
             a dial.
         attenuation: settings of the equation that reads ``sigma_d``; None exactly if ``sigma_d`` is
@@ -92,7 +92,7 @@ class Gaussians:
             if name == "shN" and shape not in [(n, count - 1, 3) for count in SH_COUNTS.values()]:
                 raise ClodError(
                     f"Gaussians.shN has shape {shape}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8,"
-                    " 15, 24"
+                    " 15"
                 )
         if (self.sigma_d is None) != (self.attenuation is None):
             raise ClodError("Gaussians needs both sigma_d and attenuation, or neither")

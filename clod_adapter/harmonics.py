@@ -28,7 +28,7 @@ def with_sh_degree(gaussians: Gaussians, sh_degree: int, places: Sequence[Place]
         places: cameras, or viewpoints; as many as possible, from where the result is to be seen.
 
     Raises:
-        ClodError: ``sh_degree`` is none of 0 to 4.
+        ClodError: ``sh_degree`` is none of 0 to 3.
 
     Example:
         >>> small = with_sh_degree(model.gaussians, 1, model.viewpoints)

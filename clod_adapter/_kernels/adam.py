@@ -7,8 +7,8 @@ from clod_adapter._kernels.elementary import vsqrt
 from clod_adapter._kernels.pointers import load_where, pointer, scratch, share, store_where
 from clod_adapter._kernels.simd import anywhere, fma, gt, load, splat
 
-# numbers of sixteen rows: at most the harmonics of degree 4, the highest that Gaussians have
-ROOM = 16 * 72
+# numbers of sixteen rows: at most the harmonics of degree 3, the highest that Gaussians have
+ROOM = 16 * 45
 
 
 @kernel

@@ -239,8 +239,8 @@ def project_gradient(
     """
     w = scratch(f32x16, WORKSPACE)
     g = scratch(f32x16, GRADIENTS)
-    sh = scratch(f32x16, 80)
-    basis = scratch(f32x16, 25)
+    sh = scratch(f32x16, 48)
+    basis = scratch(f32x16, 16)
     rows = scratch(int64, 16)
     places = scratch(int64, 16)
     lanes = scratch(int64, 16)

@@ -124,7 +124,7 @@ def load(
     (``file_formats.FORMATS``).
 
     A PLY may have Inria's, MaskGaussian's, Mip-Splatting's or our extended layout: any property
-    order, byte order or ascii, with or without normals, SH degree 0 to 4. It is read once; the
+    order, byte order or ascii, with or without normals, SH degree 0 to 3. It is read once; the
     fingerprint is of the bytes that were parsed. Of a checkpoint of several GPUs any rank stands
     for all, which lie in its folder.
 

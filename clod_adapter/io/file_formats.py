@@ -44,8 +44,8 @@ class Format(NamedTuple):
 
 PACKED = ".compressed.ply"
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
-_GLB = "float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
-_SPZ = ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",)
+_GLB = "float32", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
+_SPZ = ("6 to 24 bits, the dial 16-bit floats",)
 _CONVERTED = Format("formats.splat_transform", "formats.splat_transform.check")
 PLY = Format("ply", "ply.has_dial", carries_sigma=True, about=("exact; baked, in Inria's layout",))
 FORMATS = {

@@ -285,19 +285,13 @@ def _on_the_host(tensors: Mapping[str, Tensor]) -> Arrays:
     }
 
 
-def dropped_harmonics(arrays: Arrays, degree: int) -> tuple[str, ...]:
-    """A line where the harmonics above a degree, which a format does not store, are not 0."""
-    lost = arrays["shN"][:, SH_COUNTS[degree] - 1 :].any()
-    return (f"spherical harmonics above degree {degree} are dropped",) if lost else ()
-
-
 def half_turn(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The Gaussians under a half turn about z, between axes with y down and with y up.
 
     Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations
     ``P R P``, which gives the same ellipsoids, and harmonics of an odd order change sign.
     """
-    harmonics = [(-1) ** order for degree in range(1, 5) for order in range(-degree, degree + 1)]
+    harmonics = [(-1) ** order for degree in range(1, 4) for order in range(-degree, degree + 1)]
     bands = arrays["shN"].shape[1]
     return {
         **arrays,

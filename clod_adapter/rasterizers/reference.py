@@ -128,7 +128,7 @@ def shade(means: Tensor, sh0: Tensor, shN: Tensor, eye: Tensor) -> Tensor:
 
 
 def sh_basis(directions: Tensor) -> Tensor:
-    """The 25 real spherical harmonics up to degree 4 of unit ``directions [n, 3]``, order and signs
+    """The 16 real spherical harmonics up to degree 3 of unit ``directions [n, 3]``, order and signs
     of 3DGS.
     """
     x, y, z = directions.unbind(1)
@@ -156,15 +156,6 @@ def sh_basis(directions: Tensor) -> Tensor:
             -0.4570457994644658 * x * (4 * zz - xx - yy),
             1.445305721320277 * z * (xx - yy),
             -0.5900435899266435 * x * (xx - 3 * yy),
-            2.5033429417967046 * xy * (xx - yy),
-            -1.7701307697799304 * yz * (3 * xx - yy),
-            0.9461746957575601 * xy * (7 * zz - 1),
-            -0.6690465435572892 * yz * (7 * zz - 3),
-            0.10578554691520431 * (zz * (35 * zz - 30) + 3),
-            -0.6690465435572892 * xz * (7 * zz - 3),
-            0.47308734787878004 * (xx - yy) * (7 * zz - 1),
-            -1.7701307697799304 * xz * (xx - 3 * yy),
-            0.6258357354491761 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ],
         1,
     )

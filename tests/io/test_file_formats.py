@@ -81,9 +81,7 @@ def read(path):
 def same(kind, g, again):
     """Compares to the precision of the format."""
     *losses, sigma, angle = LOSSES.get(kind, EXACT)
-    bands = again.shN.shape[1]
-    assert bands == min(g.shN.shape[1], 24 if kind not in LOSSES else 15)
-    shN = g.shN[:, :bands].clamp(-1, 127 / 128) if "spz" in kind else g.shN[:, :bands]
+    shN = g.shN.clamp(-1, 127 / 128) if "spz" in kind else g.shN
     wanted = g.replace(shN=shN)
     names = ("means", "log_scales", "opacities", "sh0", "shN")
     for name, atol in zip(names, losses, strict=True):
@@ -115,15 +113,14 @@ def test_files_of_splat_transform(capture, kind):
 
 @pytest.mark.parametrize("suffix", WRITABLE)
 @pytest.mark.parametrize(
-    ("turn", "far", "growth"), [(0, False, False), (2, True, True), (4, False, True)]
+    ("turn", "far", "growth"), [(0, False, False), (2, True, True), (3, False, True)]
 )
 def test_dial_round_trips(tmp_path, suffix, turn, far, growth):
     """Each SH degree occurs with one format or another."""
-    degree = (WRITABLE.index(suffix) + turn) % 5
+    degree = (WRITABLE.index(suffix) + turn) % 4
     g, origin = model(degree, growth=growth), ORIGIN if far else NOWHERE
     path = tmp_path / f"a{suffix.upper()}"
-    notes = write(path, g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
-    assert ("above degree 3" in " ".join(notes)) == (degree == 4 and suffix in (".glb", ".spz"))
+    write(path, g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
     check_readable(path)
     assert file_has_dial(path)
     found = load(path, origin=origin if suffix == ".ply" else None)  # which a PLY does not store

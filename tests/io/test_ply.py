@@ -34,7 +34,7 @@ def read_back(path):
 
 @st.composite
 def files(draw):
-    degree = draw(st.integers(0, 4))
+    degree = draw(st.integers(0, 3))
     names = needed(degree)
     names += ["nx", "ny", "nz"] if draw(st.booleans()) else []
     names += draw(

@@ -54,7 +54,6 @@ RDF = 6  # right, down, forward
 ANTIALIASED = 1  # flag of a filter that compensates opacities
 EXTENDED = 2  # flag of records after the arrays
 MOST_GAUSSIANS = 10_000_000  # Gaussians that the reference reads
-DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
 _STEP = 4  # of the harmonics, which have 6 bits
@@ -89,10 +88,10 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
             f"{path}: has room for {MOST_GAUSSIANS:,} Gaussians within 4,000,000 of 0, {actual};"
             " write a .ply"
         )
-    degree = min(gaussians.sh_degree, DEGREE)
+    degree = gaussians.sh_degree
     flags = EXTENDED | (ANTIALIASED if gaussians.screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
-    sections = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
+    sections = [header, *_packed(arrays, bits), struct.pack("<III", AXES, 4, RDF)]
     metadata = replace(metadata, attenuation=gaussians.attenuation)
     if metadata != Metadata(screen_filter=CLASSIC):
         columns = list(dial_columns(arrays))
@@ -138,10 +137,10 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
     return nearer, bits, (note,)
 
 
-def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes]:
+def _packed(arrays: dict[str, np.ndarray], bits: int) -> list[bytes]:
     # Far beyond what a byte has room for, but not so far that it overflows.
     sh0 = np.clip(arrays["sh0"], -9, 9)
-    harmonics = np.clip(arrays["shN"][:, : SH_COUNTS[degree] - 1], -9, 9)
+    harmonics = np.clip(arrays["shN"], -9, 9)
     steps = np.round(arrays["means"].astype(np.float64) * 2.0**bits)
     fixed = steps.clip(-(2**23), 2**23 - 1).astype("<i4")
     columns = [
@@ -177,7 +176,6 @@ def _losses(arrays: dict[str, np.ndarray], bits: int) -> list[str]:
     notes = [
         f"positions are rounded to {2.0**-bits:.1g}, colours, opacities, scales and rotations to"
         " about 8 bits",
-        *values.dropped_harmonics(arrays, DEGREE),
     ]
     if np.abs(arrays["shN"]).max(initial=0) > 1.01:
         notes.append("harmonics beyond 1 are cut to it")
@@ -196,7 +194,7 @@ def has_dial(path: Path) -> bool:
 
 
 def read(path: Path, data: bytes) -> Source:
-    """Reads version 3, SH degree 0 to 4; versions 2 and 4 are converted by splat-transform."""
+    """Reads version 3, SH degree 0 to 3; versions 2 and 4 are converted by splat-transform."""
     if data.startswith(NEW_SPZ):
         return splat_transform.read(path, data)
     packed = data
