@@ -137,15 +137,3 @@ def test_a_dial_and_its_calibration(clod, dialled):
     clod("export DIAL --sv 2 -o x.ply")
     comment = "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n"
     assert comment in clod("inspect x.ply").out
-
-
-def test_adapter(clod):
-    text = clod("inspect ADAPTER").out
-    about = clod("inspect ADAPTER --json").report["about"]
-    assert "an adapter" in text
-    assert "with SHA-256 " in text
-    assert "max_sv 4" in text
-    assert "\ngrowth_d " in text
-    assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(about["growth"]) == 5
-    assert about["updates"] == {}
-    assert about["count"] == 540 and about["config"]["iters"] == 12
