@@ -28,7 +28,9 @@ def sh_basis(degree, x, y, z, out):
     out[0] = splat(C0)
     if degree < 1:
         return
-    out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
+    out[1] = -C1 * y
+    out[2] = C1 * z
+    out[3] = -C1 * x
     if degree < 2:
         return
     xx = x * x
@@ -37,14 +39,21 @@ def sh_basis(degree, x, y, z, out):
     xy = x * y
     yz = y * z
     xz = x * z
-    out[4], out[5], out[7] = C20 * xy, -C20 * yz, -C20 * xz
-    out[6], out[8] = C22 * (2 * zz - xx - yy), C24 * (xx - yy)
+    out[4] = C20 * xy
+    out[5] = -C20 * yz
+    out[7] = -C20 * xz
+    out[6] = C22 * (2 * zz - xx - yy)
+    out[8] = C24 * (xx - yy)
     if degree < 3:
         return
     four = 4 * zz - xx - yy
-    out[9], out[10], out[11] = C30 * y * (3 * xx - yy), C31 * xy * z, C32 * y * four
-    out[12], out[13] = C33 * z * (2 * zz - 3 * xx - 3 * yy), C32 * x * four
-    out[14], out[15] = C35 * z * (xx - yy), C30 * x * (xx - 3 * yy)
+    out[9] = C30 * y * (3 * xx - yy)
+    out[10] = C31 * xy * z
+    out[11] = C32 * y * four
+    out[12] = C33 * z * (2 * zz - 3 * xx - 3 * yy)
+    out[13] = C32 * x * four
+    out[14] = C35 * z * (xx - yy)
+    out[15] = C30 * x * (xx - 3 * yy)
 
 
 @inlined
@@ -91,7 +100,9 @@ def view_direction(w, cam, out):
     y = w[MEAN + 1] - cam[EYE + 1]
     z = w[MEAN + 2] - cam[EYE + 2]
     inverse = 1 / vsqrt(x * x + y * y + z * z)
-    out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
+    out[0] = x * inverse
+    out[1] = y * inverse
+    out[2] = z * inverse
     return inverse
 
 
@@ -137,12 +148,15 @@ def color(first, count, stored, drawing, packed):
             green = fma(basis[k + 1], sh[3 * k + 1], green)
             blue = fma(basis[k + 1], sh[3 * k + 2], blue)
         finite = bits_of(gt(HUGE, vabs(red) + vabs(green) + vabs(blue)))
-        w[0], w[1], w[2] = vmax(red, 0), vmax(green, 0), vmax(blue, 0)
+        w[0] = vmax(red, 0)
+        w[1] = vmax(green, 0)
+        w[2] = vmax(blue, 0)
         store_rows(records, targets, RECORD, RED, 3, w, 0)
         for at in range(start, min(start + 16, end)):
             if (finite >> uint64(at - start)) & uint64(1):
                 if kept < at:
-                    depths[kept], ids[kept] = depths[at], ids[at]
+                    depths[kept] = depths[at]
+                    ids[kept] = ids[at]
                     for k in range(RECORD):
                         records[kept * RECORD + k] = records[at * RECORD + k]
                 kept += 1

@@ -68,7 +68,8 @@ def calibrate(
         ClodError: a PSNR is infinite.
     """
     assert measured.attenuation is not None
-    camera, machine = scene.test[0].camera, machine_name(measured.means.device.type)
+    camera = scene.test[0].camera
+    machine = machine_name(measured.means.device.type)
     stored = list(spread(scene.train, VIEWPOINTS))
     if against != "photographs":  # of placed cameras some look at little; viewers open at the first
         stored.sort(key=_interest, reverse=True)
