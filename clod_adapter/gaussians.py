@@ -127,10 +127,13 @@ class Gaussians:
             return False
         if self.screen_filter != other.screen_filter:
             return False
-        pairs = [(mine[name], theirs[name]) for name in mine]
-        return all(
-            (a.device, a.dtype) == (b.device, b.dtype) and torch.equal(a, b) for a, b in pairs
-        )
+        for name, value in mine.items():
+            other_value = theirs[name]
+            if (value.device, value.dtype) != (other_value.device, other_value.dtype):
+                return False
+            if not torch.equal(value, other_value):
+                return False
+        return True
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -208,9 +211,11 @@ class Gaussians:
         image, faster.
         """
         degree = self.sh_degree
-        while (
-            degree > 0 and not self.shN[:, SH_COUNTS[degree - 1] - 1 : SH_COUNTS[degree] - 1].any()
-        ):
+        while degree > 0:
+            first = SH_COUNTS[degree - 1] - 1
+            last = SH_COUNTS[degree] - 1
+            if self.shN[:, first:last].any():
+                break
             degree -= 1
         return self.without_bands(degree)
 

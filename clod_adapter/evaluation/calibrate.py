@@ -101,4 +101,8 @@ def _interest(view: View) -> float:
 
 
 def _change(image: Tensor) -> float:
-    return sum(float(image.diff(dim=dim).abs().mean()) for dim in (0, 1) if image.shape[dim] > 1)
+    change = 0.0
+    for dim in (0, 1):
+        if image.shape[dim] > 1:
+            change += float(image.diff(dim=dim).abs().mean())
+    return change

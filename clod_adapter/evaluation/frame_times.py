@@ -84,7 +84,10 @@ def time_frames(
     passes = list[list[float]]()
     while len(passes) < PASSES and (len(passes) < FEWEST or time.perf_counter() - began < SECONDS):
         seconds = [timed_frame(model, view, s)[1] for view, (model, s) in product(views, jobs)]
-        passes.append([1e3 * statistics.fmean(seconds[k :: len(jobs)]) for k in range(len(jobs))])
+        milliseconds_of_jobs = []
+        for k in range(len(jobs)):
+            milliseconds_of_jobs.append(1e3 * statistics.fmean(seconds[k :: len(jobs)]))
+        passes.append(milliseconds_of_jobs)
         tell(progress, Phase.FRAME_TIMES, len(passes), PASSES)
     columns = zip(*passes, strict=True)
     milliseconds = []

@@ -30,7 +30,7 @@ from clod_adapter.io.settings import (
     stated_filter,
     tagged,
 )
-from clod_adapter.io.values import SIGMA, Activated, prepared
+from clod_adapter.io.values import SIGMA, Activated, Prepared, prepared
 from clod_adapter.origin import NOWHERE, Origin
 
 # Adapted files of three captures keep 38 to 97 % at s = 1, with sigma_d in other units 3 to 43 %.
@@ -158,7 +158,6 @@ def load(
     )
     arrays = values.arrays
     rows = source.rows
-    total = len(values.keep)
     if not values.keep.all():
         arrays = {name: array[values.keep] for name, array in arrays.items()}
         rows = None if rows is None else rows[values.keep]
@@ -167,17 +166,7 @@ def load(
     gaussians = Gaussians(
         **tensors, attenuation=metadata.attenuation if dial else None, screen_filter=screen_filter
     )
-    dropped = [
-        f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in values.dropped.items()
-    ]
-    notes = [*values.changes, *dropped]
-    if arrays["opacity_logits"].max() == np.inf:  # else no mask is made
-        opaque = np.count_nonzero(arrays["opacity_logits"] == np.inf)
-        notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
-    if any(values.origin):
-        where = ", ".join(f"{value:.10g}" for value in values.origin)
-        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
-    notes += metadata.notes
+    notes = [*_notes_of(values, arrays["opacity_logits"]), *metadata.notes]
     if gaussians.attenuation is not None and not metadata.described:
         notes += plausibility(arrays, gaussians.attenuation)
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
@@ -195,6 +184,20 @@ def load(
         values.origin,
         filter_known=dial or metadata.screen_filter is not None,
     )
+
+
+def _notes_of(values: Prepared, opacity_logits: np.ndarray) -> list[str]:
+    """What was changed or dropped, and what is odd about the rest, one line each."""
+    notes = [*values.changes]
+    for reason, lost in values.dropped.items():
+        notes.append(f"{lost} of {len(values.keep)} Gaussians dropped: {reason}")
+    if opacity_logits.max() == np.inf:  # else no mask is made
+        opaque = np.count_nonzero(opacity_logits == np.inf)
+        notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
+    if any(values.origin):
+        where = ", ".join(f"{value:.10g}" for value in values.origin)
+        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
+    return notes
 
 
 @torch.no_grad()

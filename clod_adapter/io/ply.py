@@ -168,7 +168,9 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     groups = column_map(sh_degree) | dial_columns(names)
     groups |= {MASKS: MASK_COLUMNS} if set(MASK_COLUMNS) <= set(names) else {}
     groups |= {FILTER_3D: (FILTER_3D,)} if FILTER_3D in names else {}
-    arrays: Arrays = {key: np.empty((len(rows), len(group)), "f4") for key, group in groups.items()}
+    arrays: Arrays = {}
+    for key, group in groups.items():
+        arrays[key] = np.empty((len(rows), len(group)), "f4")
     if any(rows.dtype[name].itemsize == 8 for name in "xyz"):
         arrays["means"] = np.empty((len(rows), 3))
     with np.errstate(over="ignore", invalid="ignore"):  # invalid: a NaN that signals

@@ -137,7 +137,10 @@ def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
         "rows": _by_field(CalibrationRow, stored.pop(ROW, [])),
         "viewpoints": _by_field(Viewpoint, stored.pop(VIEWPOINT, [])),
     }
-    settings = {name: " ".join(lines[-1]) for name, lines in stored.items() if lines[-1]}
+    settings = {}
+    for name, lines in stored.items():
+        if lines[-1]:
+            settings[name] = " ".join(lines[-1])
     extent = settings.pop(EXTENT, "").split(maxsplit=4)
     measured |= zip(("total", "views", "width", "height", "against"), extent, strict=False)
     if MACHINE in settings:
@@ -256,12 +259,8 @@ def write_rows(
                 values = values.reshape(len(block), -1)
                 for k, name in enumerate(group):
                     shift = origin[k] if attribute == "means" else 0.0
-                    new = values[:, k]
-                    changed = np.ones(len(block), bool)
-                    if base is not None and name not in dial:
-                        old = (block[name] - shift if shift else block[name]).astype(np.float32)
-                        changed = new.view(np.uint32) != old.view(np.uint32)
-                    new = new[changed]
+                    is_stored = base is not None and name not in dial
+                    new = _overwrite(block[name], values[:, k], shift, is_stored)
                     usable = np.isfinite(new)
                     if attribute == "opacity_logits" and base is None:
                         usable |= new == np.inf
@@ -270,6 +269,18 @@ def write_rows(
                         raise ClodError(
                             f"{path}: {attribute} holds a new value that is not finite; {fix}"
                         )
-                    block[name][changed] = new.astype(np.float64) + shift if shift else new
             file.write(block.astype(kind.newbyteorder("<"), copy=False).data)
     return ()
+
+
+def _overwrite(column: np.ndarray, values: np.ndarray, shift: float, is_stored: bool) -> np.ndarray:
+    """Puts values, plus ``shift``, into a column, of one that ``is_stored`` where they are not its
+    own; returns the new ones.
+    """
+    changed = np.ones(len(column), bool)
+    if is_stored:
+        old = (column - shift if shift else column).astype(np.float32)
+        changed = values.view(np.uint32) != old.view(np.uint32)
+    new = values[changed]
+    column[changed] = new.astype(np.float64) + shift if shift else new
+    return new

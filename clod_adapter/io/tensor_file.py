@@ -26,7 +26,9 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     safetensors' ``save`` holds all of it in memory; ``save_file`` takes names in UTF-8 only, and
     makes files that only their owner can read.
     """
-    arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
+    arrays = {}
+    for name, tensor in tensors.items():
+        arrays[name] = tensor.detach().cpu().contiguous().numpy()
     header: dict[str, Any] = {"__metadata__": dict(metadata)}
     at = 0
     names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))

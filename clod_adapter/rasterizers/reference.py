@@ -102,7 +102,8 @@ def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tup
     covariance = half @ half.transpose(1, 2) + screen_filter.variance * torch.eye(2).to(half)
     if not screen_filter.compensate:
         return covariance, opacities
-    unblurred = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
+    normal = torch.linalg.cross(half[:, 0], half[:, 1])
+    unblurred = normal.square().sum(1)
     ratio = unblurred / torch.linalg.det(covariance)
     has_area = ratio > 0  # the derivative of the square root at 0 is infinite
     compensated = opacities * ratio.where(has_area, 1).sqrt().where(has_area, 0)
@@ -112,7 +113,8 @@ def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tup
 def blend(alphas: Tensor) -> tuple[Tensor, Tensor]:
     """Front-to-back weights ``[pixels, n]`` and the remaining transmittance ``[pixels]``."""
     through = torch.cumprod(1 - alphas, 1)
-    before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], 1)
+    first = torch.ones_like(through[:, :1])
+    before = torch.cat([first, through[:, :-1]], 1)
     alive = before > T_MIN
     weights = torch.where(alive, alphas * before, 0)
     return weights, torch.where(alive, 1 - alphas, 1).prod(1)
