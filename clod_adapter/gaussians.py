@@ -204,7 +204,8 @@ class Gaussians:
 
     def select(self, rows: Tensor | slice) -> Gaussians:
         """The Gaussians at ``rows`` (a boolean mask ``[N]``, indices ``[M]`` or a slice)."""
-        return self.replace(**{name: value[rows] for name, value in self.tensors().items()})
+        selected = {name: value[rows] for name, value in self.tensors().items()}
+        return self.replace(**selected)
 
     def without_empty_bands(self) -> Gaussians:
         """A copy without the highest SH degrees whose coefficients are all 0; renders the same
@@ -227,7 +228,8 @@ class Gaussians:
 
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""
-        return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})
+        moved = {name: value.to(device) for name, value in self.tensors().items()}
+        return self.replace(**moved)
 
     def cpu(self) -> Gaussians:
         """A copy in main memory."""

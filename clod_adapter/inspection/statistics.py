@@ -32,7 +32,8 @@ class Spread:
     def of(cls, values: np.ndarray) -> Spread:
         """Summarize a non-empty array."""
         with np.errstate(invalid="ignore"):  # between two infinite ones
-            low, median, high = map(float, np.quantile(values, (BULK[0], 0.5, BULK[1])))
+            quantiles = np.quantile(values, (BULK[0], 0.5, BULK[1]))
+        low, median, high = map(float, quantiles)
         return cls(float(values.min()), low, median, high, float(values.max()))
 
     def moved(self, by: float) -> Spread:

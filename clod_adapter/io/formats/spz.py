@@ -165,7 +165,8 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     packed = largest.astype(np.uint32)
     for axis in range(4):
         component = xyzw[:, axis]
-        level = np.floor(MAGNITUDE * np.abs(component) + 0.5).clip(max=511).astype(np.uint32)
+        level = np.floor(MAGNITUDE * np.abs(component) + 0.5)
+        level = level.clip(max=511).astype(np.uint32)
         sign = np.uint32(512) * (component < 0)
         longer = (packed << 10) | sign | level
         packed = np.where(largest == axis, packed, longer)
@@ -287,6 +288,7 @@ def _unquantized(columns: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
     wide = np.zeros((len(means), 3, 4), np.uint8)
     wide[..., 1:] = means.reshape(-1, 3, 3)
     fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
+    levels = harmonics.reshape(len(means), -1, 3).astype(np.float32)
     # so that logits are finite: the first and last level are a quarter of a level from 0 and 1
     shares = opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255
     return {
@@ -295,7 +297,7 @@ def _unquantized(columns: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
         "log_scales": scales.astype(np.float32) / 16 - 10,
         "opacity_logits": values.logit(shares),
         "sh0": ((colors.astype(np.float32) / 255 - 0.5) / COLOR)[:, None],
-        "shN": (harmonics.reshape(len(means), -1, 3).astype(np.float32) - 128) / 128,
+        "shN": (levels - 128) / 128,
     }
 
 
@@ -310,5 +312,6 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
         xyzw[:, axis] = np.where(stored, np.where(packed & 512, -value, value), 0)
         packed = np.where(stored, packed >> 10, packed)
     squares = (xyzw**2).sum(1)
-    xyzw[np.arange(len(xyzw)), largest] = np.sqrt(np.maximum(0, 1 - squares))
+    rows = np.arange(len(xyzw))
+    xyzw[rows, largest] = np.sqrt(np.maximum(0, 1 - squares))
     return np.roll(xyzw, 1, axis=1).astype(np.float32)
