@@ -4,8 +4,8 @@
 
 A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format
 that stores one and read again. PSNR is between the renders at s and those of the PLY, as means over
-the held-out views, in floating point; null where they are equal. ``.splat`` stores no sigma_d: a
-model baked at s is written and compared. Each format adds one row to ``results/formats.jsonl``.
+the held-out views, in floating point; null where they are equal. Each format adds one row to
+``results/formats.jsonl``.
 """
 
 import math
@@ -15,7 +15,7 @@ from statistics import fmean
 
 import clod_adapter as clod
 from clod_adapter.initialization.importance import initialize, usable_views
-from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
+from clod_adapter.io.file_formats import WRITABLE, write
 from clod_adapter.losses import decibels
 from common import Table, append, arguments, checkpoint, last, photographs
 
@@ -60,23 +60,11 @@ SHOWN = {  # in the table: the dial, settings, PSNR of the pictures, readers
             "Spark 2.2), without the dial"
         ),
     ),
-    ".safetensors": (
-        "tensors `sigma_d`, `growth_d`, float32",
-        "metadata",
-        "",
-        "the safetensors library; no viewer",
-    ),
     ".pt": (
         'tensors `splats["sigma_d"]`, `splats["growth_d"]`, float32',
         "string `clod_adapter`",
         "",
         "gsplat's trainer and viewer",
-    ),
-    ".splat": (
-        "none: one dial value, baked",
-        "none",
-        "{both} dB against the baked PLY",
-        "most web viewers (Spark 2.2), splat-transform",
     ),
 }
 
@@ -92,17 +80,14 @@ def run(scene, config):
     base, views = checkpoint(scene).gaussians, photographs(scene)
     model = initialize(base, usable_views(base, views.train), config, lambda *_: None)
     cameras = [view.camera for view in views.test]
-    trained_on = [view.camera for view in views.train]
-    baked = {s: clod.bake(model, s, cameras=trained_on) for s in DIALS}
     for suffix in WRITABLE:
-        dial = FORMATS[suffix].carries_sigma
-        row = {"scene": scene, "suffix": suffix, "dial": dial}
+        row = {"scene": scene, "suffix": suffix}
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"model{suffix}"
+            row |= round_trip(path, model)
+            again = clod.load(path).gaussians
             for s in DIALS:
-                source = model if dial else baked[s]
-                row |= round_trip(path, source) if s == 1 or not dial else {}
-                row[f"s{s:g}"] = pictures(source, clod.load(path).gaussians, cameras, s)
+                row[f"s{s:g}"] = pictures(model, again, cameras, s)
         append(FILE, row)
 
 
@@ -153,9 +138,7 @@ def page_table():
         error = max(row["sigma_error"] or 0 for row in rows)
         size = span([row["bytes_per_gaussian"] for row in rows])
         off = f"{error:.0e}".replace("e-0", "e-") if error else "0"
-        lines.append(
-            [f"`{suffix}`", dial, settings, size, off if rows[0]["dial"] else "", image, readers]
-        )
+        lines.append([f"`{suffix}`", dial, settings, size, off, image, readers])
     return Table(HEADS, lines, found.values())
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.settings import WARNING
 
-from .shared.console import duration
 from .shared.outputs import size
 
 if TYPE_CHECKING:
@@ -24,21 +23,16 @@ WIDTH = 13  # of the labels
 MOST_ROWS = 8  # of a calibration, including the first and last
 MOST_LINES = 6  # under one label
 LONGEST = 100  # characters of a comment
-SETTINGS = ("max_sv", "iters", "seed", "form")  # of the training settings, those shown
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
-    given.add_argument(
-        "file", metavar="FILE", help="a splat, an adapter, or the state of an interrupted run"
-    )
+    given.add_argument("file", metavar="FILE", help="a splat")
     parser.set_defaults(quiet=True)
 
 
 def check(args: Namespace) -> None:
-    path = Path(args.file)
-    if path.suffix.lower() != ".safetensors":  # an adapter or a state is no splat
-        check_readable(path)
+    check_readable(Path(args.file))
 
 
 def execute(args: Namespace) -> dict[str, Any]:
@@ -58,8 +52,7 @@ def lines_of(found: Inspection) -> list[str]:
                 found.writer,
             )
         )
-    lines += splat_lines(found.splat) if found.splat else []
-    lines += tensor_lines(found.about) if found.about else []
+    lines += splat_lines(found.splat)
     lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies]) + _block(
         "excluded", found.left_out
     )
@@ -129,36 +122,6 @@ def calibration_lines(calibration: Calibration | None) -> list[str]:
     return lines + [_line("", numbers.format(*astuple(row))) for row in rows]
 
 
-def tensor_lines(about: dict[str, Any]) -> list[str]:
-    lines = [_line("Gaussians", f"{about['count']:,}")]
-    if about["kind"] == "state":
-        after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"
-        return [
-            *lines,
-            _line("after", after),
-            _line("of", ", ".join(f"{k} {v}" for k, v in about["belongs"].items())),
-        ]
-    lines.append(_line("for the file", f"with SHA-256 {about['base']}"))
-    lines.append(
-        _line(
-            "changes",
-            ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only the dial",
-        )
-    )
-    settings = ", ".join(
-        f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS
-    )
-    lines.append(_line("trained with", settings or "unknown settings"))
-    columns = {
-        name: about[key]
-        for name, key in (("sigma_d", "sigma"), ("growth_d", "growth"))
-        if about[key]
-    }
-    lines += ["", *spread_table([*columns.items()]), ""]
-    lines.append(_line("dial", f"{' and '.join(columns)}, {_settings(about['attenuation'])}"))
-    return lines + calibration_lines(about["calibration"])
-
-
 def _settings(attenuation: AttenuationConfig) -> str:
     """The settings of a dial in words."""
     form = "the paper's form" if attenuation.form == "paper" else "distances in world units"
@@ -179,14 +142,13 @@ def _line(name: str, says: str) -> str:
 DESCRIPTION = "Print what a file is, who wrote it, what is in it, and what adapting excludes."
 USAGE = "FILE [--json]"
 EPILOG = """\
-FILE can be a PLY (also compressed), gsplat's .pt, an adapter or the state of an
-interrupted run (.safetensors), any format of clod-adapt export, and, with
-splat-transform installed, .sog or .ksplat.
+FILE can be a PLY, gsplat's .pt, a .glb or .spz, and, with splat-transform
+installed, a compressed PLY, .sog, .splat or .ksplat.
 
-  looks like   a guess from comments and the order of properties
+  looks like   by comments of the file
   needle       a Gaussian more than 10 times as long as its second axis
 
 examples:
   clod-adapt inspect garden.ply
-  clod-adapt inspect garden_clod.safetensors --json
+  clod-adapt inspect garden_clod.ply --json
 """

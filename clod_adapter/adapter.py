@@ -201,7 +201,8 @@ def extract(
     near = adapted
     if adapted.near is not None and base.near is None:
         near, far = (adapted.select(rows) for rows in (adapted.near, ~adapted.near))
-        added = {name: getattr(far, name).detach().float().cpu().clone() for name in ATTRIBUTES}
+        for name in ATTRIBUTES:
+            added[name] = getattr(far, name).detach().float().cpu().clone()
     for name in ATTRIBUTES:
         old = getattr(base, name).detach().float()
         new = getattr(near, name).detach().float()
@@ -212,9 +213,9 @@ def extract(
             )
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
-    columns: Any = {
-        name: x.detach().float().cpu().clone() for name, x in dial_tensors(adapted).items()
-    }
+    columns: dict[str, Any] = {}
+    for name, column in dial_tensors(adapted).items():
+        columns[name] = column.detach().float().cpu().clone()
     return Adapter(
         **columns,
         attenuation=adapted.attenuation,

@@ -25,10 +25,11 @@ from clod_adapter.gaussians import OPAQUE, Gaussians
 # Exponents of the dial value that opacities and scales are baked at for several cameras: the best
 # on held-out photographs of FADED 0, 0.5, 0.75 and 1, and then of seven GROWN from 0 to 1.25. At
 # equal counts the file is never below the dial by more than 0.05 dB, and up to 0.65 dB above it.
-FADED, GROWN = 0.75, 0.9
+FADED = 0.75
+GROWN = 0.9
 MOST = 100.0  # multiplier of the distances at which levels begin
-# share of the Gaussians in the coarsest level, and the largest number of levels
-FEWEST, LEVELS = 0.01, 16
+FEWEST = 0.01  # share of the Gaussians in the coarsest level
+LEVELS = 16  # the largest number of levels
 
 
 @torch.no_grad()
@@ -192,7 +193,9 @@ def _of_several(
 
     Far Gaussians take over from near ones at once, in the middle of their zone.
     """
-    near, attenuation, whole = gaussians.near, gaussians.attenuation, gaussians
+    near = gaussians.near
+    attenuation = gaussians.attenuation
+    whole = gaussians
     if near is not None:  # which do not end by themselves
         assert attenuation is not None and gaussians.sigma_d is not None
         sigma_d = gaussians.sigma_d.masked_fill(near, math.inf)
@@ -210,7 +213,8 @@ def _of_several(
 def _logits_drawn(shown: Attenuated, logits: Tensor) -> Tensor:
     """``[N]`` the logits of the drawn opacities; bit for bit ``logits`` where these are equal."""
     # By the fade's logarithm, and by expm1 and not 1 - o, which cancels where o is near 1.
-    opacities, stored = logits.sigmoid(), torch.nn.functional.logsigmoid(logits)
+    opacities = logits.sigmoid()
+    stored = torch.nn.functional.logsigmoid(logits)
     drawn = stored + torch.where(opacities > 0, shown.drawn / opacities, 1).log()
     baked = (drawn - torch.log(-torch.expm1(drawn))).clamp(max=OPAQUE)
     same = (drawn == stored) & logits.isfinite()

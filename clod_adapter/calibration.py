@@ -162,7 +162,9 @@ class Calibration:
             values = row.virtual_scale, row.kept, row.psnr, row.ssim, row.frame_ms
             by_dial[float(row.virtual_scale)] = CalibrationRow(*map(float, values))
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
-        return cls(tuple(by_dial.values()), width=size[0], height=size[1], machine=name, **others)
+        width, height = size
+        rows = tuple(by_dial.values())
+        return cls(rows, width=width, height=height, machine=name, **others)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Calibration:

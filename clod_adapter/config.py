@@ -27,7 +27,7 @@ KINDS: dict[str, tuple[type, str]] = {
     "bool": (bool, "true or false"),
     "str": (str, "text"),
 }
-SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
+SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16}  # spherical harmonics of each degree
 
 
 def option(default: Any, help: str) -> Any:

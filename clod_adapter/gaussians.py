@@ -40,7 +40,7 @@ class Gaussians:
         log_scales: ``[N, 3]`` logarithms of the standard deviations along the axes, world units.
         opacity_logits: ``[N]``; the opacity is their sigmoid. +inf means fully opaque.
         sh0: ``[N, 1, 3]`` degree-0 spherical harmonics.
-        shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16, 25}.
+        shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16}.
         sigma_d: ``[N]`` reaches, the distances at which they end, or None for a checkpoint without
             a dial.
         attenuation: settings of the equation that reads ``sigma_d``; None exactly if ``sigma_d`` is
@@ -92,7 +92,7 @@ class Gaussians:
             if name == "shN" and shape not in [(n, count - 1, 3) for count in SH_COUNTS.values()]:
                 raise ClodError(
                     f"Gaussians.shN has shape {shape}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8,"
-                    " 15, 24"
+                    " 15"
                 )
         if (self.sigma_d is None) != (self.attenuation is None):
             raise ClodError("Gaussians needs both sigma_d and attenuation, or neither")
@@ -127,10 +127,13 @@ class Gaussians:
             return False
         if self.screen_filter != other.screen_filter:
             return False
-        pairs = [(mine[name], theirs[name]) for name in mine]
-        return all(
-            (a.device, a.dtype) == (b.device, b.dtype) and torch.equal(a, b) for a, b in pairs
-        )
+        for name, value in mine.items():
+            other_value = theirs[name]
+            if (value.device, value.dtype) != (other_value.device, other_value.dtype):
+                return False
+            if not torch.equal(value, other_value):
+                return False
+        return True
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -201,16 +204,19 @@ class Gaussians:
 
     def select(self, rows: Tensor | slice) -> Gaussians:
         """The Gaussians at ``rows`` (a boolean mask ``[N]``, indices ``[M]`` or a slice)."""
-        return self.replace(**{name: value[rows] for name, value in self.tensors().items()})
+        selected = {name: value[rows] for name, value in self.tensors().items()}
+        return self.replace(**selected)
 
     def without_empty_bands(self) -> Gaussians:
         """A copy without the highest SH degrees whose coefficients are all 0; renders the same
         image, faster.
         """
         degree = self.sh_degree
-        while (
-            degree > 0 and not self.shN[:, SH_COUNTS[degree - 1] - 1 : SH_COUNTS[degree] - 1].any()
-        ):
+        while degree > 0:
+            first = SH_COUNTS[degree - 1] - 1
+            last = SH_COUNTS[degree] - 1
+            if self.shN[:, first:last].any():
+                break
             degree -= 1
         return self.without_bands(degree)
 
@@ -222,7 +228,8 @@ class Gaussians:
 
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""
-        return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})
+        moved = {name: value.to(device) for name, value in self.tensors().items()}
+        return self.replace(**moved)
 
     def cpu(self) -> Gaussians:
         """A copy in main memory."""

@@ -28,7 +28,7 @@ def with_sh_degree(gaussians: Gaussians, sh_degree: int, places: Sequence[Place]
         places: cameras, or viewpoints; as many as possible, from where the result is to be seen.
 
     Raises:
-        ClodError: ``sh_degree`` is none of 0 to 4.
+        ClodError: ``sh_degree`` is none of 0 to 3.
 
     Example:
         >>> small = with_sh_degree(model.gaussians, 1, model.viewpoints)
@@ -55,12 +55,12 @@ def _fitted(means: Tensor, shN: Tensor, kept: int, places: Sequence[Place]) -> T
     products = torch.zeros(len(means), kept, 3, dtype=torch.float64, device=means.device)
     for place in places:
         away = means.double() - position_of(place, means).double()
-        basis = sh_basis(away / away.norm(dim=1, keepdim=True).clamp(min=1e-12))[
-            :, : kept + high.shape[1]
-        ]
+        distances = away.norm(dim=1, keepdim=True).clamp(min=1e-12)
+        basis = sh_basis(away / distances)[:, : kept + high.shape[1]]
         low = basis[:, :kept]
         lost = (basis[:, kept:, None] * high).sum(1)
         squares += low[:, :, None] * low[:, None]
         products += low[:, :, None] * lost[:, None]
-    ridge = RIDGE * max(len(places), 1) * torch.eye(kept, dtype=torch.float64, device=means.device)
+    identity = torch.eye(kept, dtype=torch.float64, device=means.device)
+    ridge = RIDGE * max(len(places), 1) * identity
     return torch.linalg.solve(squares + ridge, products)

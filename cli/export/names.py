@@ -24,7 +24,7 @@ FORMATS = {
     ),
 }
 # formats in which every reader finds the screen-space filter
-STORE_FILTER = (".spz", ".safetensors", PAGE)
+STORE_FILTER = (".spz", PAGE)
 # options that make OUT a folder, and its index
 FOLDERS = {"--lod-meta": "lod-meta.json", "--3dtiles": "tileset.json"}
 

@@ -6,4 +6,5 @@ ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.999
 T_MIN = 1e-4
 # Shortest and longest quaternion that is drawn; readers drop others. Its square must fit float32.
-QUAT_MIN, QUAT_MAX = 1e-15, 1e15
+QUAT_MIN = 1e-15
+QUAT_MAX = 1e15

@@ -7,8 +7,8 @@ from clod_adapter._kernels.elementary import vsqrt
 from clod_adapter._kernels.pointers import load_where, pointer, scratch, share, store_where
 from clod_adapter._kernels.simd import anywhere, fma, gt, load, splat
 
-# numbers of sixteen rows: at most the harmonics of degree 4, the highest that Gaussians have
-ROOM = 16 * 72
+# numbers of sixteen rows: at most the harmonics of degree 3, the highest that Gaussians have
+ROOM = 16 * 45
 
 
 @kernel
@@ -44,7 +44,8 @@ def adam_rows(
     beta1 = splat(float32(beta1))
     beta2 = splat(float32(beta2))
     epsilon = float32(epsilon)
-    rest1, rest2 = 1 - beta1, 1 - beta2
+    rest1 = 1 - beta1
+    rest2 = 1 - beta2
     begin, end = share(worker, workers, len(parameter))
     lengths = scratch(float32, ROOM)
     factors = scratch(float32, ROOM)
@@ -68,7 +69,8 @@ def adam_rows(
                 length = rate * units[stride * row] * corrections[0, count]
                 factor = corrections[1, count]
                 for k in range(width * (row - start), width * (row - start + 1)):
-                    lengths[k], factors[k] = length, factor
+                    lengths[k] = length
+                    factors[k] = factor
         for k in range(0, 16 * width, 16):
             factor = load(factors, k)
             at = width * start + k

@@ -55,7 +55,8 @@ from clod_adapter._kernels.simd import (
 )
 from clod_adapter._kernels.tiles import spans
 
-BLOCK, ACROSS = 4, 16  # pixels of a block, and blocks of a tile
+BLOCK = 4  # pixels of a side
+ACROSS = 16  # blocks of a tile
 BLOCKS = ACROSS * ACROSS
 WORDS = BLOCKS // 64
 FORWARD_STATE = BLOCKS * 64
@@ -343,7 +344,8 @@ def blend_gradient(
                     at = block * 80
                     t = load(state, at)
                     met = meet(g, t, block)
-                    dx, dy = met.dx, met.dy
+                    dx = met.dx
+                    dy = met.dy
                     weight = select(met.blends, t * met.alpha, 0)
                     v_r = load(state, at + 32)
                     v_g = load(state, at + 48)
@@ -359,8 +361,10 @@ def blend_gradient(
                     s = select(both(met.blends, ge(ALPHA_MAX, met.unlimited)), v_a * met.alpha, 0)
                     s_0 = s_0 + s
                     if shaped:
-                        sx, sy = s * dx, s * dy
-                        s_x, s_y = s_x + sx, s_y + sy
+                        sx = s * dx
+                        sy = s * dy
+                        s_x = s_x + sx
+                        s_y = s_y + sy
                         s_xx = fma(sx, dx, s_xx)
                         s_xy = fma(sx, dy, s_xy)
                         s_yy = fma(sy, dy, s_yy)

@@ -1,4 +1,4 @@
-"""Colours: real spherical harmonics up to degree 4, in the order and signs of 3DGS, of sixteen
+"""Colours: real spherical harmonics up to degree 3, in the order and signs of 3DGS, of sixteen
 Gaussians at a time.
 """
 
@@ -20,13 +20,6 @@ C31 = float32(2.890611442640554)
 C32 = float32(-0.4570457994644658)
 C33 = float32(0.3731763325901154)
 C35 = float32(1.445305721320277)
-C40 = float32(2.5033429417967046)
-C41 = float32(-1.7701307697799304)
-C42 = float32(0.9461746957575601)
-C43 = float32(-0.6690465435572892)
-C44 = float32(0.10578554691520431)
-C46 = float32(0.47308734787878004)
-C48 = float32(0.6258357354491761)
 
 
 @inlined
@@ -35,7 +28,9 @@ def sh_basis(degree, x, y, z, out):
     out[0] = splat(C0)
     if degree < 1:
         return
-    out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
+    out[1] = -C1 * y
+    out[2] = C1 * z
+    out[3] = -C1 * x
     if degree < 2:
         return
     xx = x * x
@@ -44,21 +39,21 @@ def sh_basis(degree, x, y, z, out):
     xy = x * y
     yz = y * z
     xz = x * z
-    out[4], out[5], out[7] = C20 * xy, -C20 * yz, -C20 * xz
-    out[6], out[8] = C22 * (2 * zz - xx - yy), C24 * (xx - yy)
+    out[4] = C20 * xy
+    out[5] = -C20 * yz
+    out[7] = -C20 * xz
+    out[6] = C22 * (2 * zz - xx - yy)
+    out[8] = C24 * (xx - yy)
     if degree < 3:
         return
     four = 4 * zz - xx - yy
-    out[9], out[10], out[11] = C30 * y * (3 * xx - yy), C31 * xy * z, C32 * y * four
-    out[12], out[13] = C33 * z * (2 * zz - 3 * xx - 3 * yy), C32 * x * four
-    out[14], out[15] = C35 * z * (xx - yy), C30 * x * (xx - 3 * yy)
-    if degree < 4:
-        return
-    out[16], out[17] = C40 * xy * (xx - yy), C41 * yz * (3 * xx - yy)
-    out[18], out[19] = C42 * xy * (7 * zz - 1), C43 * yz * (7 * zz - 3)
-    out[20], out[21] = C44 * (zz * (35 * zz - 30) + 3), C43 * xz * (7 * zz - 3)
-    out[22], out[23] = C46 * (xx - yy) * (7 * zz - 1), C41 * xz * (xx - 3 * yy)
-    out[24] = C48 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy))
+    out[9] = C30 * y * (3 * xx - yy)
+    out[10] = C31 * xy * z
+    out[11] = C32 * y * four
+    out[12] = C33 * z * (2 * zz - 3 * xx - 3 * yy)
+    out[13] = C32 * x * four
+    out[14] = C35 * z * (xx - yy)
+    out[15] = C30 * x * (xx - 3 * yy)
 
 
 @inlined
@@ -95,29 +90,6 @@ def sh_basis_gradient(degree, x, y, z, v):
         )
         gz += C31 * xy * v[10] + 8 * C32 * yz * v[11] + 3 * C33 * (2 * zz - xx - yy) * v[12]
         gz += 8 * C32 * xz * v[13] + C35 * (xx - yy) * v[14]
-    if degree >= 4:
-        seven = 7 * zz
-        gx += (
-            C40 * y * (3 * xx - yy) * v[16]
-            + 6 * C41 * xy * z * v[17]
-            + C42 * y * (seven - 1) * v[18]
-        )
-        gx += C43 * z * (seven - 3) * v[21] + 2 * C46 * x * (seven - 1) * v[22]
-        gx += 3 * C41 * z * (xx - yy) * v[23] + 4 * C48 * x * (xx - 3 * yy) * v[24]
-        gy += (
-            C40 * x * (xx - 3 * yy) * v[16]
-            + 3 * C41 * z * (xx - yy) * v[17]
-            + C42 * x * (seven - 1) * v[18]
-        )
-        gy += C43 * z * (seven - 3) * v[19] - 2 * C46 * y * (seven - 1) * v[22]
-        gy += -6 * C41 * xy * z * v[23] + 4 * C48 * y * (yy - 3 * xx) * v[24]
-        gz += (
-            C41 * y * (3 * xx - yy) * v[17]
-            + 14 * C42 * xy * z * v[18]
-            + C43 * y * (3 * seven - 3) * v[19]
-        )
-        gz += C44 * z * (140 * zz - 60) * v[20] + C43 * x * (3 * seven - 3) * v[21]
-        gz += 14 * C46 * z * (xx - yy) * v[22] + C41 * x * (xx - 3 * yy) * v[23]
     return gx, gy, gz
 
 
@@ -128,7 +100,9 @@ def view_direction(w, cam, out):
     y = w[MEAN + 1] - cam[EYE + 1]
     z = w[MEAN + 2] - cam[EYE + 2]
     inverse = 1 / vsqrt(x * x + y * y + z * z)
-    out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
+    out[0] = x * inverse
+    out[1] = y * inverse
+    out[2] = z * inverse
     return inverse
 
 
@@ -150,8 +124,8 @@ def color(first, count, stored, drawing, packed):
     depths = packed.depths
     ids = packed.ids
     w = scratch(f32x16, 16)
-    sh = scratch(f32x16, 80)
-    basis = scratch(f32x16, 25)
+    sh = scratch(f32x16, 48)
+    basis = scratch(f32x16, 16)
     rows = scratch(int64, 16)
     targets = scratch(int64, 16)
     terms = (drawing.degree + 1) * (drawing.degree + 1) - 1
@@ -174,12 +148,15 @@ def color(first, count, stored, drawing, packed):
             green = fma(basis[k + 1], sh[3 * k + 1], green)
             blue = fma(basis[k + 1], sh[3 * k + 2], blue)
         finite = bits_of(gt(HUGE, vabs(red) + vabs(green) + vabs(blue)))
-        w[0], w[1], w[2] = vmax(red, 0), vmax(green, 0), vmax(blue, 0)
+        w[0] = vmax(red, 0)
+        w[1] = vmax(green, 0)
+        w[2] = vmax(blue, 0)
         store_rows(records, targets, RECORD, RED, 3, w, 0)
         for at in range(start, min(start + 16, end)):
             if (finite >> uint64(at - start)) & uint64(1):
                 if kept < at:
-                    depths[kept], ids[kept] = depths[at], ids[at]
+                    depths[kept] = depths[at]
+                    ids[kept] = ids[at]
                     for k in range(RECORD):
                         records[kept * RECORD + k] = records[at * RECORD + k]
                 kept += 1

@@ -20,25 +20,41 @@ HUGE = float32(3e38)  # larger values are dropped as not finite
 
 # Columns of a record, the 64 bytes the blending loops read of a visible Gaussian. The exponent of
 # its alpha is in powers of two: log2 alpha = LOG - (QA dx^2 + QB dx dy + QC dy^2).
-MX, MY = 0, 1
-QA, QB, QC = 2, 3, 4
+MX = 0
+MY = 1
+QA = 2
+QB = 3
+QC = 4
 LOG = 5
-RED, GREEN, BLUE = 6, 7, 8
-REACH, RX, DET = 9, 10, 11
-X0, Y0 = 12, 13
-X1, Y1 = 14, 15
+RED = 6
+GREEN = 7
+BLUE = 8
+REACH = 9
+RX = 10
+DET = 11
+X0 = 12
+Y0 = 13
+X1 = 14
+Y1 = 15
 RECORD = 16
 
 # A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y,
 # high y, centre in world coordinates (3), near plane; then the screen-space filter: its variance
 # (px^2), and 1 if opacities are compensated for it.
-FX, FY = 16, 17
-CX, CY = 18, 19
-WIDTH, HEIGHT = 20, 21
-LOW_X, HIGH_X = 22, 23
-LOW_Y, HIGH_Y = 24, 25
+FX = 16
+FY = 17
+CX = 18
+CY = 19
+WIDTH = 20
+HEIGHT = 21
+LOW_X = 22
+HIGH_X = 23
+LOW_Y = 24
+HIGH_Y = 25
 EYE = 26
-NEAR, BLUR, COMPENSATE = 29, 30, 31
+NEAR = 29
+BLUR = 30
+COMPENSATE = 31
 CAMERA = 32
 
 # The workspace of sixteen Gaussians: vectors with one lane per Gaussian. As stored: mean (3),

@@ -33,8 +33,10 @@ from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax
 
 # A dial: (s / D)^2 and (s / (D r))^2, in 1 / world units^2, 1 / H^2 (0 without near Gaussians), and
 # 1 where scales and opacities are activated and there is no dial.
-RATE2, GROWTH_RATE2 = 0, 1
-NEAR2, ACTIVATED = 2, 3
+RATE2 = 0
+GROWTH_RATE2 = 1
+NEAR2 = 2
+ACTIVATED = 3
 DIAL = 4
 
 LN2 = float32(0.6931471805599453)

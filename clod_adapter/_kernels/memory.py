@@ -11,7 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-IDLE, IDLE_FLOATS = 48, 1 << 27  # most idle arrays, and their size; beyond it the oldest is freed
+# beyond these the oldest idle array is freed
+IDLE = 48  # arrays
+IDLE_FLOATS = 1 << 27
 _SMALL = 16384
 _idle: dict[int, list[np.ndarray]] = {}
 _recent: deque[int] = deque()

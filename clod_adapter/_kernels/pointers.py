@@ -189,7 +189,11 @@ def _addresses(builder, table, rows, width, first):
 
 def _lanes(builder, lanes, at, count=LANES):
     """The addresses of ``count`` vectors from ``lanes[at]`` on."""
-    return [builder.gep(lanes, [builder.add(at, ir.Constant(I64, k))]) for k in range(count)]
+    addresses = []
+    for k in range(count):
+        index = builder.add(at, ir.Constant(I64, k))
+        addresses.append(builder.gep(lanes, [index]))
+    return addresses
 
 
 @operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
@@ -248,7 +252,8 @@ def store_sums(builder, values, index, *summands):
     """``values[index : index + 9]`` = the sums over the lanes of the nine vectors."""
     vectors = list(summands)
     nine = _first(builder, ir.Constant(I64, len(summands)))
-    even, odd = (ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))) for k in range(2))
+    even = ir.Constant(INTEGERS, list(range(0, 2 * LANES, 2)))
+    odd = ir.Constant(INTEGERS, list(range(1, 2 * LANES, 2)))
     while len(vectors) > 1:  # adds neighbouring lanes until one vector holds all the sums, in order
         vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors
         pairs = zip(vectors[::2], vectors[1::2], strict=True)

@@ -126,7 +126,9 @@ def covariance(cam, w):
     p5 = w[PMAT + 5]
     xx = p0 * p0 + p1 * p1 + p2 * p2
     yy = p3 * p3 + p4 * p4 + p5 * p5
-    w[COV], w[COV + 1], w[COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
+    w[COV] = xx + blur
+    w[COV + 1] = p0 * p3 + p1 * p4 + p2 * p5
+    w[COV + 2] = yy + blur
     cx = p1 * p5 - p2 * p4
     cy = p2 * p3 - p0 * p5
     cz = p0 * p4 - p1 * p3
@@ -182,12 +184,12 @@ def make_records(w, centre, opacity, cam, record):
     mx = load(centre, 0)
     my = load(centre, 16)
     idet = 1 / w[COVDET]
-    record[MX], record[MY] = mx, my
-    record[QA], record[QC] = (
-        0.5 * LOG2E * w[COV + 2] * idet,
-        0.5 * LOG2E * w[COV] * idet,
-    )
-    record[QB], record[DET] = -(LOG2E * w[COV + 1] * idet), LOG2E * LOG2E * idet
+    record[MX] = mx
+    record[MY] = my
+    record[QA] = 0.5 * LOG2E * w[COV + 2] * idet
+    record[QC] = 0.5 * LOG2E * w[COV] * idet
+    record[QB] = -(LOG2E * w[COV + 1] * idet)
+    record[DET] = LOG2E * LOG2E * idet
     if cam[COMPENSATE] > 0:  # NaN for an infinite covariance, which is not drawn
         opacity = opacity * vsqrt(w[RAWDET] * idet)
     drawn = ge(opacity, ALPHA_MIN)
@@ -196,7 +198,8 @@ def make_records(w, centre, opacity, cam, record):
     reach = vmax(record[LOG] + LOG2_255, 0)
     rx = vsqrt(TWO_LN2 * reach * w[COV])
     ry = vsqrt(TWO_LN2 * reach * w[COV + 2])
-    record[REACH], record[RX] = reach, rx
+    record[REACH] = reach
+    record[RX] = rx
     record[X0] = vmax(vceil(mx - rx - 0.5 - SLACK), 0)
     record[X1] = vmin(vfloor(mx + rx - 0.5 + SLACK), cam[WIDTH] - 1)
     record[Y0] = vmax(vceil(my - ry - 0.5 - SLACK), 0)
@@ -225,7 +228,9 @@ def add_records(rows, filled, at, spare, means, opacity, cam, w, packed):
     for lane in range(16):
         targets[lane] = spare
         if (bits >> uint64(lane)) & uint64(1):
-            packed.depths[at], packed.ids[at], targets[lane] = centre[32 + lane], rows[lane], at
+            packed.depths[at] = centre[32 + lane]
+            packed.ids[at] = rows[lane]
+            targets[lane] = at
             at += 1
     store_rows(packed.records, targets, RECORD, 0, RECORD, record, 0)
     return at

@@ -63,10 +63,12 @@ def covariance_gradient(w, g, cam, compensated):
                 cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
                 t0 += w[PMAT + 3 + j] * cross
                 t1 -= w[PMAT + j] * cross
-        t0, t1 = t0 * idet, t1 * idet
+        t0 = t0 * idet
+        t1 = t1 * idet
         m0 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1
         m1 = g[SUMS + 7] * t0 + g[SUMS + 8] * t1
-        g[V_P + k], g[V_P + 3 + k] = a * m0 + b * m1, b * m0 + e * m1
+        g[V_P + k] = a * m0 + b * m1
+        g[V_P + 3 + k] = b * m0 + e * m1
         if compensated is not None:
             compensation_gradient(w, g, k, t0, t1)
         g[V_SCALE + k] = splat(0)
@@ -109,7 +111,8 @@ def point_gradient(w, g, v_x, v_y, cam):
     x = w[POINT]
     y = w[POINT + 1]
     iz = 1 / w[POINT + 2]
-    rx, ry = x * iz, y * iz
+    rx = x * iz
+    ry = y * iz
     clamped_x = vmin(vmax(rx, cam[LOW_X]), cam[HIGH_X])
     clamped_y = vmin(vmax(ry, cam[LOW_Y]), cam[HIGH_Y])
     j00 = j02 = j11 = j12 = splat(0)
@@ -157,8 +160,10 @@ def quat_gradient(w, g):
     v2 = 2 * (q1 * xy + q3 * yz + q0 * y - 2 * q2 * (g[r] + g[r + 8]))
     v3 = 2 * (q1 * xz + q2 * yz + q0 * z - 2 * q3 * (g[r] + g[r + 4]))
     along = v0 * q0 + v1 * q1 + v2 * q2 + v3 * q3
-    g[V_QUAT], g[V_QUAT + 1] = (v0 - along * q0) * w[QINV], (v1 - along * q1) * w[QINV]
-    g[V_QUAT + 2], g[V_QUAT + 3] = (v2 - along * q2) * w[QINV], (v3 - along * q3) * w[QINV]
+    g[V_QUAT] = (v0 - along * q0) * w[QINV]
+    g[V_QUAT + 1] = (v1 - along * q1) * w[QINV]
+    g[V_QUAT + 2] = (v2 - along * q2) * w[QINV]
+    g[V_QUAT + 3] = (v3 - along * q3) * w[QINV]
 
 
 @inlined
@@ -181,13 +186,16 @@ def color_gradient(w, g, shN, rows, drawing, sh, basis, tuned, v_shN):
         b = basis[k + 1]
         at = 3 * k
         basis[k + 1] = sh[at] * red + sh[at + 1] * green + sh[at + 2] * blue
-        sh[at], sh[at + 1], sh[at + 2] = b * red, b * green, b * blue
+        sh[at] = b * red
+        sh[at + 1] = b * green
+        sh[at + 2] = b * blue
     if tuned:
         for first in range(0, 3 * terms, 16):
             store_rows(v_shN, rows, 3 * terms, first, min(3 * terms - first, 16), sh, first)
     gx, gy, gz = sh_basis_gradient(degree, x, y, z, basis)
     along = gx * x + gy * y + gz * z
-    g[V_MEAN], g[V_MEAN + 1] = (gx - along * x) * inverse, (gy - along * y) * inverse
+    g[V_MEAN] = (gx - along * x) * inverse
+    g[V_MEAN + 1] = (gy - along * y) * inverse
     g[V_MEAN + 2] = (gz - along * z) * inverse
 
 
@@ -239,8 +247,8 @@ def project_gradient(
     """
     w = scratch(f32x16, WORKSPACE)
     g = scratch(f32x16, GRADIENTS)
-    sh = scratch(f32x16, 80)
-    basis = scratch(f32x16, 25)
+    sh = scratch(f32x16, 48)
+    basis = scratch(f32x16, 16)
     rows = scratch(int64, 16)
     places = scratch(int64, 16)
     lanes = scratch(int64, 16)
@@ -264,7 +272,8 @@ def project_gradient(
     done = first
     for start in range(first, end, 16):
         for lane in range(16):
-            places[lane], lanes[lane] = min(start + lane, end - 1), lane
+            places[lane] = min(start + lane, end - 1)
+            lanes[lane] = lane
             row = rows[lane] = packed.ids[places[lane]]
             if row > done:
                 no_gradient(done, row, shaped, colored, terms, gradients)

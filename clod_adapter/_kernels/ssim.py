@@ -14,7 +14,8 @@ from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.pointers import pointers, share
 from clod_adapter._kernels.simd import fma, load, splat, store
 
-RADIUS, PAD = 5, 16
+RADIUS = 5
+PAD = 16
 _taps = np.exp(-((np.arange(11) - RADIUS) ** 2) / (2 * 1.5**2))
 TAPS = (_taps / _taps.sum()).astype(np.float32)
 C1 = float32(0.01**2)
@@ -79,8 +80,10 @@ def ssim_slopes(worker, workers, planes, width, sums):
                 where = (channel * height + near) * step + at
                 p = load(planes.x, where)
                 q = load(planes.y, where)
-                tp, tq = tap * p, tap * q
-                m_x, m_y = m_x + tp, m_y + tq
+                tp = tap * p
+                tq = tap * q
+                m_x = m_x + tp
+                m_y = m_y + tq
                 m_xx = fma(tp, p, m_xx)
                 m_yy = fma(tq, q, m_yy)
                 m_xy = fma(tp, q, m_xy)
@@ -130,7 +133,9 @@ def loss_gradient(worker, workers, planes, width, l1, dssim, v_image, sums):
         channel = task // height
         row = task % height
         for at in range(PAD, step - PAD, 16):
-            m, s, p = zero, zero, zero
+            m = zero
+            s = zero
+            p = zero
             for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
                 tap = TAPS[near - row + RADIUS]
                 where = (channel * height + near) * step + at

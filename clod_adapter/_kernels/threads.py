@@ -13,7 +13,8 @@ import torch
 from clod_adapter._support.workers import shared, submit
 
 _lock = threading.Lock()
-_alone, _before = 0, 0  # contexts open now, and torch's threads before the first
+_alone = 0  # contexts open now
+_before = 0  # torch's threads before the first
 
 
 def worker_count() -> int:

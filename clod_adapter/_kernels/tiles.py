@@ -58,7 +58,8 @@ def spans(records, r, ox, oy, side):
     x0 = select(eq(left, 0 - tip), -rx, (0 - wide - qb * left) * (0.5 / qa))
     low = (vmax(vceil(mx + x0 - SLACK), records[r + X0]) - float32(ox)) * (1 / side)
     high = (vmin(vfloor(mx + x1 + SLACK), records[r + X1]) - float32(ox)) * (1 / side)
-    low, high = vfloor(low), vfloor(high)  # of cells
+    low = vfloor(low)  # of cells
+    high = vfloor(high)
     # the columns of a needle may have crossed by rounding
     touched = both(ge(bottom, top), ge(high, low))
     return select(touched, low, 0), select(touched, high, -1)
@@ -78,7 +79,8 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):
         first = len(depths) * worker // len(counts)
         for k in range(first, first + counts[worker]):
             key = depths[k]
-            keys[n], order[n] = key, k
+            keys[n] = key
+            order[n] = k
             n += 1
             for place in range(3):
                 digits[place, (key >> np.uint32(11 * place)) & np.uint32(2047)] += 1
@@ -166,7 +168,8 @@ def list_tiles(
                 at = cursor[ty * across + tx]
                 cursor[ty * across + tx] = at + 1
                 if listed:
-                    entries[at], entry_slots[at] = p, slot
+                    entries[at] = p
+                    entry_slots[at] = slot
                 slot += 1
         if listed:
             slots[2 * p + 1] = slot

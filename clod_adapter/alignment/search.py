@@ -185,6 +185,7 @@ def _shrunk(view: View, width: int) -> View:
     if camera.width <= width:
         return view
     height = max(1, round(camera.height * width / camera.width))
-    planes = F.adaptive_avg_pool2d(view.image.permute(2, 0, 1).float(), (height, width))
+    pixels = view.image.permute(2, 0, 1).float()
+    planes = F.adaptive_avg_pool2d(pixels, (height, width))
     image = planes.permute(1, 2, 0).round().to(torch.uint8)
     return View(camera.resized(width, height), image)

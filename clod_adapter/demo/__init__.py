@@ -54,7 +54,8 @@ def draw(
     """Draws a held-out view of the base, the dial and the merged base, and their quality over all
     held-out views.
     """
-    scene, original = load_scene(capture), load(base).gaussians
+    scene = load_scene(capture)
+    original = load(base).gaussians
     merged_to = merging(original, scene)
     strip = compared(original, load(model).gaussians, scene.test[VIEW], merged_to)
     dial_strip(pictures["dial"], strip, TITLE)
@@ -111,7 +112,8 @@ def dial_strip(
     right = crop[0] + crop[2]
     top = crop[1]
     bottom = crop[1] + crop[3]
-    tall, cell = [height / width, crop[3] / crop[2]], 2.6  # inches
+    tall = [height / width, crop[3] / crop[2]]
+    cell = 2.6  # inches
     with new_figure((len(panels) * cell, cell * sum(tall) + 1.1), layout="constrained") as figure:
         figure.suptitle(title, fontsize=11, weight="bold", x=0.01, ha="left")
         columns = figure.subplots(2, len(panels), height_ratios=tall, squeeze=False).T
@@ -119,10 +121,8 @@ def dial_strip(
             pixels = panel.image if panel.image.dtype == np.uint8 else np.clip(panel.image, 0, 1)
             whole.imshow(pixels, interpolation="antialiased", aspect="auto")
             part.imshow(pixels[top:bottom, left:right], interpolation="nearest", aspect="auto")
-            xs, ys = (
-                np.array([left, right, right, left, left]),
-                np.array([top, top, bottom, bottom, top]),
-            )
+            xs = np.array([left, right, right, left, left])
+            ys = np.array([top, top, bottom, bottom, top])
             whole.plot(xs - 0.5, ys - 0.5, color="white", linewidth=1.4, scalex=False, scaley=False)
             whole.set_axis_off()
             part.set(xticks=[], yticks=[], frame_on=False)
@@ -146,7 +146,8 @@ def quality_curve(
         axes.set_xscale("log")
         axes.margins(x=0.1, y=0.16)
         for name, some, colour in (("the dial", rows, BLUE), ("merged", merged, ORANGE)):
-            kept, values = [row["kept"] for row in some], [row[key] for row in some]
+            kept = [row["kept"] for row in some]
+            values = [row[key] for row in some]
             axes.plot(kept, values, "-o", color=colour, linewidth=1.8, label=name)
         points = [("base", base_row), *((f"{row['virtual_scale']:g}", row) for row in rows)]
         for text, row in points:

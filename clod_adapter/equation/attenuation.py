@@ -260,7 +260,8 @@ def conform(**tensors: Tensor) -> list[Tensor]:
             )
         require(tensor.is_floating_point(), name, tensor.dtype, "floating point: .float()")
     shapes = {name: tuple(t.shape) for name, t in tensors.items()}
-    if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
+    distinct = set(shapes.values())
+    if len(distinct) != 1 or len(distinct.pop()) != 1:
         listed = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
         raise ClodError(f"expected one shape [N], got {listed}")
     dtypes = [tensor.dtype for tensor in tensors.values()]

@@ -48,4 +48,6 @@ def soft_count(
         F.logsigmoid(opacity_logits.double()) - decay(sigma_d, far) - math.log(TAU * virtual_scale)
     )
     soft = (margin / width).sigmoid()
-    return ((margin.detach() > 0).double() + soft - soft.detach()).sum() / max(len(margin), 1)
+    hard = (margin.detach() > 0).double()
+    count = hard + soft - soft.detach()
+    return count.sum() / max(len(margin), 1)

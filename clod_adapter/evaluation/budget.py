@@ -152,7 +152,8 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
         raise ClodError(
             "a PSNR drop needs the calibration table that adapting stores with the file"
         )
-    best, last = calibration.rows[0].psnr, calibration.rows[-1]
+    best = calibration.rows[0].psnr
+    last = calibration.rows[-1]
     # From the largest s, where 1/s ascends: the point from which, down to s = 1, the loss stays
     # within the drop.
     nearness = [1 / row.virtual_scale for row in reversed(calibration.rows)]
@@ -180,7 +181,8 @@ def _for_count(
     all cameras.
     """
     views = [cameras] if baked or not cameras else [[camera] for camera in cameras]
-    largest, wanted = config.max_sv, math.floor(keep * len(views))
+    largest = config.max_sv
+    wanted = math.floor(keep * len(views))
 
     @lru_cache(maxsize=1)  # all at once would be views times Gaussians
     def kept_in(k: int) -> Callable[[float], Tensor]:
@@ -193,7 +195,8 @@ def _for_count(
     def count(virtual_scale: float) -> int:
         return sum(int(kept_in(k)(virtual_scale).sum()) for k in range(len(views)))
 
-    most, fewest = count(1.0), count(largest)
+    most = count(1.0)
+    fewest = count(largest)
     if wanted >= most:
         note = (
             f"s = 1 keeps {most / len(views):,.0f} of {gaussians.whole:,} already"
@@ -212,7 +215,8 @@ def _for_count(
                 f"{keep:,.0f} Gaussians are out of reach: {fewest / len(views):,.0f} remain at any"
                 " dial value"
             )
-    low, high = 1.0, largest
+    low = 1.0
+    high = largest
     while high / low > 1 + PRECISION:
         middle = math.sqrt(low * high)
         low, high = (low, middle) if count(middle) <= wanted else (middle, high)

@@ -68,7 +68,8 @@ def calibrate(
         ClodError: a PSNR is infinite.
     """
     assert measured.attenuation is not None
-    camera, machine = scene.test[0].camera, machine_name(measured.means.device.type)
+    camera = scene.test[0].camera
+    machine = machine_name(measured.means.device.type)
     stored = list(spread(scene.train, VIEWPOINTS))
     if against != "photographs":  # of placed cameras some look at little; viewers open at the first
         stored.sort(key=_interest, reverse=True)
@@ -100,4 +101,8 @@ def _interest(view: View) -> float:
 
 
 def _change(image: Tensor) -> float:
-    return sum(float(image.diff(dim=dim).abs().mean()) for dim in (0, 1) if image.shape[dim] > 1)
+    change = 0.0
+    for dim in (0, 1):
+        if image.shape[dim] > 1:
+            change += float(image.diff(dim=dim).abs().mean())
+    return change

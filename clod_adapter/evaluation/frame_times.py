@@ -21,12 +21,16 @@ from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import Rendering, render
 
-VIEWS, PASSES, FEWEST = 3, 5, 3
+VIEWS = 3
+PASSES = 5
+FEWEST = 3
 # after which no pass begins, once there are FEWEST; a pass that would take a third of it has one
 # view
 SECONDS = 10.0
 # the warm-up ends with two frames whose times differ by a tenth
-WARM_FRAMES, WARM_SECONDS, STEADY = 8, 2.0, 0.1
+WARM_FRAMES = 8
+WARM_SECONDS = 2.0
+STEADY = 0.1
 NOISY = 0.2  # a larger range of the passes, as a share of the time, is reported
 
 Model = tuple[Gaussians, Sequence[float]]  # and the dial values, ascending, to time it at
@@ -76,13 +80,18 @@ def time_frames(
     views = cameras[:: -(-len(cameras) // VIEWS)]
     if slowest * len(views) * len(jobs) > SECONDS / FEWEST:
         views = views[len(views) // 2 :][:1]
-    began, passes = time.perf_counter(), list[list[float]]()
+    began = time.perf_counter()
+    passes = list[list[float]]()
     while len(passes) < PASSES and (len(passes) < FEWEST or time.perf_counter() - began < SECONDS):
         seconds = [timed_frame(model, view, s)[1] for view, (model, s) in product(views, jobs)]
-        passes.append([1e3 * statistics.fmean(seconds[k :: len(jobs)]) for k in range(len(jobs))])
+        milliseconds_of_jobs = []
+        for k in range(len(jobs)):
+            milliseconds_of_jobs.append(1e3 * statistics.fmean(seconds[k :: len(jobs)]))
+        passes.append(milliseconds_of_jobs)
         tell(progress, Phase.FRAME_TIMES, len(passes), PASSES)
     columns = zip(*passes, strict=True)
-    milliseconds, ranges = [], []
+    milliseconds = []
+    ranges = []
     for _, dials in models:
         quartiles = [statistics.quantiles(next(columns), n=4, method="inclusive") for _ in dials]
         milliseconds.append(tuple(middle for _, middle, _ in quartiles))
@@ -94,7 +103,8 @@ def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> floa
     """Renders until the times are steady, with compiled functions and a raised clock rate; the last
     time, seconds.
     """
-    began, before = time.perf_counter(), 0.0
+    began = time.perf_counter()
+    before = 0.0
     for _ in range(WARM_FRAMES):
         taken = timed_frame(gaussians, camera, virtual_scale)[1]
         if abs(taken - before) <= STEADY * taken or time.perf_counter() - began > WARM_SECONDS:

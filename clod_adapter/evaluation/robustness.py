@@ -79,8 +79,9 @@ def baseline(
         return progress(replace(now, done=done, total=len(shares) * len(views)))
 
     for share in shares:
-        # in their own order
-        pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)
+        count = max(1, round(share * len(base)))
+        rows_kept = order[:count].sort().values  # in their own order
+        pruned = base.select(rows_kept)
         (row,) = evaluate_all(pruned, views, [1.0], tell_all)
         rows.append(row.as_dict() | {"kept_share": len(pruned) / len(base)})
     return CellResult(rows, distribution(base))
@@ -98,7 +99,8 @@ def distribution(gaussians: Gaussians) -> dict[str, Any]:
         inner = torch.tensor(edges[1:-1], dtype=torch.float32)
         bins = torch.bucketize(values.detach().cpu().float(), inner, right=True)
         counts = bins.bincount(minlength=len(edges) - 1)
-        histograms[name] = {"edges": list(edges), "shares": (counts / max(len(values), 1)).tolist()}
+        shares = counts / max(len(values), 1)
+        histograms[name] = {"edges": list(edges), "shares": shares.tolist()}
     return histograms
 
 

@@ -13,14 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.config import SH_COUNTS
-from clod_adapter.inspection.statistics import FAR, Dial, Splat, Spread, values_of
+from clod_adapter.inspection.statistics import FAR, Dial, Splat, values_of
 from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, Head
-from clod_adapter.io.ply_layout import COLUMN, PREFIX, RGB, column_map, inria_dtype, is_coloured
-from clod_adapter.io.ply_packed import is_packed
-from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
-from clod_adapter.io.values import FILTER_3D, choice_of, dial_columns, in_question, prepared
+from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map
+from clod_adapter.io.settings import Source, matching_calibration, stated_filter
+from clod_adapter.io.values import (
+    FILTER_3D,
+    Prepared,
+    choice_of,
+    dial_columns,
+    in_question,
+    prepared,
+)
 
 NORMALS = ("nx", "ny", "nz")
 NERFSTUDIO = "nerfstudio's exporter, ns-export gaussian-splat"
@@ -55,10 +60,9 @@ class Inspection:
     what: str  # the kind of file, in a few words
     writer: str | None  # the program that probably wrote it
     notes: tuple[str, ...]  # of the reader
-    splat: Splat | None = None
-    about: dict[str, Any] | None = None  # of an adapter or a training state
-    anomalies: tuple[Anomaly, ...] = ()
-    left_out: tuple[str, ...] = ()  # what adapting leaves out or does not change, one line each
+    splat: Splat
+    anomalies: tuple[Anomaly, ...]
+    left_out: tuple[str, ...]  # what adapting leaves out or does not change, one line each
 
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""
@@ -68,18 +72,40 @@ class Inspection:
 
 
 def inspect(path: str | Path) -> Inspection:
-    """Inspects a splat in any format that ``load`` reads, an adapter, or the state of an
-    interrupted run.
-    """
+    """Inspects a splat in any format that ``load`` reads."""
     path = Path(path)
-    if path.suffix.lower() == ".safetensors" and (inspection := _inspect_tensors(path)):
-        return inspection
     source = read_source(path)
     metadata = source.metadata
     head = source.head
-    notes = [*source.notes, *source.metadata.notes]
+    notes = [*source.notes, *metadata.notes]
     questions = in_question(source.arrays) if source.activation_unknown else {}
     rows = prepared(path, source.arrays, choice_of(questions), metadata.origin, None)
+    splat = _splat_of(source, rows, notes)
+    writer = f"clod-adapter {metadata.version}" if metadata.version else None
+    if head:
+        writer = looks_like(head)
+    if writer == NERFSTUDIO:
+        notes.append(
+            "in nerfstudio's own frame: its dataparser_transforms.json belongs in the scene's"
+            " folder"
+        )
+    kind = f"an adapted splat, with {splat.dial_columns}" if splat.dial else "a splat"
+    packed = "compressed " * any("quantised" in note for note in source.notes)
+    return Inspection(
+        str(path),
+        path.stat().st_size,
+        f"{kind}, {packed}{'PLY' if head else path.suffix.lower()}",
+        writer,
+        tuple(notes),
+        splat,
+        anomalies=anomalies_of(splat, questions),
+        left_out=left_out_of(splat, source.notes, rows.changes),
+    )
+
+
+def _splat_of(source: Source, rows: Prepared, notes: list[str]) -> Splat:
+    """The statistics of a file; adds what is odd about its dial to the notes."""
+    metadata = source.metadata
     values = values_of(rows)
     dial = None
     if metadata.attenuation is not None:
@@ -94,86 +120,39 @@ def inspect(path: str | Path) -> Inspection:
         notes += mismatch
     degree = math.isqrt(rows.arrays["shN"].shape[1])
     encoding = ""
-    columns: tuple[tuple[str, str], ...] = ()
-    if head:
-        columns = tuple(
-            (column.name, str(np.dtype(column.val_dtype)))
-            for column in head.ply["vertex"].properties
-        )
-        order = "little" if head.ply.byte_order in "<=" else "big"
-        encoding = "ascii" if head.ply.text else f"binary {order}-endian"
-    extra: tuple[str, ...] = ()
-    if not head or not is_packed(head.ply):
-        extra = extra_columns([name for name, _ in columns], degree)
-    splat = Splat(
+    columns = []
+    if source.head:
+        ply = source.head.ply
+        for column in ply["vertex"].properties:
+            columns.append((column.name, str(np.dtype(column.val_dtype))))
+        order = "little" if ply.byte_order in "<=" else "big"
+        encoding = "ascii" if ply.text else f"binary {order}-endian"
+    return Splat(
         **values,
         sh_degree=degree,
         encoding=encoding,
-        columns=columns,
-        extra=extra,
+        columns=tuple(columns),
+        extra=extra_columns([name for name, _ in columns], degree),
         comments=tuple(comment for comment in source.comments if not comment.startswith(PREFIX)),
         origin=rows.origin,
         dial=dial,
         screen_filter=stated_filter(source),
     )
-    writer = f"clod-adapter {metadata.version}" if metadata.version else None
-    if head:
-        writer = looks_like(head)
-    if writer == NERFSTUDIO:
-        notes.append(
-            "in nerfstudio's own frame: its dataparser_transforms.json belongs in the scene's"
-            " folder"
-        )
-    kind = f"an adapted splat, with {splat.dial_columns}" if splat.dial else "a splat"
-    packed = "compressed " * any("quantised" in note for note in source.notes)
-    description = f"{kind}, {packed}{'PLY' if head else path.suffix.lower()}"
-    return Inspection(
-        str(path),
-        path.stat().st_size,
-        description,
-        writer,
-        tuple(notes),
-        splat,
-        anomalies=anomalies_of(splat, questions),
-        left_out=left_out_of(splat, source.notes, rows.changes),
-    )
 
 
 def looks_like(head: Head) -> str | None:
-    """The program that probably wrote a PLY with this header; None where it is not a known one."""
+    """The program that wrote a PLY with this header, by its comments."""
     for pattern, who in COMMENTS:
         for comment in head.comments:
             if match := re.fullmatch(pattern, comment.strip()):
                 return who.format(*match.groups())
-    if is_packed(head.ply):
-        return "gsplat's exporter, or a tool of PlayCanvas"
-    names = [p.name for p in head.ply["vertex"].properties] if "vertex" in head.ply else []
-    if set(MASK_COLUMNS) <= set(names):
-        return "MaskGaussian's trainer, an early version"
-    if FILTER_3D in names:
-        return "Mip-Splatting's trainer"
-    plain = [
-        name for name in names if name not in dial_columns(names) and not name.startswith(COLUMN)
-    ]
-    rest_count = sum(name.startswith("f_rest_") for name in names)
-    degree = next(
-        (degree for degree, count in SH_COUNTS.items() if 3 * (count - 1) == rest_count), 0
-    )
-    inria = list(inria_dtype(degree).names or ())
-    if plain == inria:
-        return "Inria's trainer, or one of the many that write its layout"
-    if plain == [name for name in inria if name not in NORMALS]:
-        return "gsplat's exporter, or another that writes Inria's layout without normals"
-    groups = column_map(degree)
-    if plain[:11] == [*groups["means"], *groups["quats"], *groups["log_scales"], "opacity"]:
-        return "splat-transform"
     return None
 
 
 def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
     """The properties of a PLY without a meaning here."""
     with_meaning = {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER_3D}
-    with_meaning.update(*column_map(sh_degree).values(), RGB if is_coloured(names) else ())
+    with_meaning.update(*column_map(sh_degree).values())
     return tuple(name for name in names if name not in with_meaning and not name.startswith(COLUMN))
 
 
@@ -240,52 +219,3 @@ def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> t
         further = f" and {len(splat.extra) - 6} more" * (len(splat.extra) > 6)
         lines.append(f"{', '.join(splat.extra[:6])}{further}: not used, copied to outputs")
     return (*lines, *(change for change in changes if "taken as activated" in change))
-
-
-def _inspect_tensors(path: Path) -> Inspection | None:
-    """Inspects an adapter or a state; None where it is neither."""
-    from clod_adapter.adapter import kind_of
-    from clod_adapter.io.adapter_file import load_adapter
-    from clod_adapter.io.file_formats import KEY
-    from clod_adapter.io.tensor_file import read_tensor_header
-    from clod_adapter.training.state import KEY as STATE_KEY
-    from clod_adapter.training.state import load_state
-
-    metadata = read_tensor_header(path)[1]
-    writer = None
-    notes = tuple[str, ...]()
-    about: dict[str, Any]
-    if STATE_KEY in metadata:
-        description = "the state of an interrupted run, for --resume"
-        state, run_metadata = load_state(path)
-        about = {
-            "kind": "state",
-            "writer": None,
-            "count": next((len(tensor) for tensor in state.tensors.values() if tensor.ndim), 0),
-            "steps": state.steps,
-            "seconds": state.seconds,
-            "loss": state.loss,
-            "belongs": run_metadata,
-            "attenuation": state.attenuation,
-        }
-    elif f'"{ADAPTER}"' in metadata.get(KEY, ""):
-        description = "an adapter: what clod-adapt learned, without its checkpoint"
-        adapter = load_adapter(path)
-        writer = f"clod-adapter {adapter.version}"
-        notes = adapter.notes
-        about = {
-            "kind": "adapter",
-            "writer": writer,
-            "count": len(adapter.sigma_d),
-            "base": adapter.base_fingerprint,
-            "attenuation": adapter.attenuation,
-            "config": adapter.config,
-            "updates": {name: kind_of(update) for name, update in adapter.updates.items()},
-            "origin": list(adapter.origin),
-            "sigma": Spread.of(adapter.sigma_d.numpy()),
-            "growth": None if adapter.growth_d is None else Spread.of(adapter.growth_d.numpy()),
-            "calibration": adapter.calibration,
-        }
-    else:
-        return None
-    return Inspection(str(path), path.stat().st_size, description, writer, notes, about=about)

@@ -32,7 +32,8 @@ class Spread:
     def of(cls, values: np.ndarray) -> Spread:
         """Summarize a non-empty array."""
         with np.errstate(invalid="ignore"):  # between two infinite ones
-            low, median, high = map(float, np.quantile(values, (BULK[0], 0.5, BULK[1])))
+            quantiles = np.quantile(values, (BULK[0], 0.5, BULK[1]))
+        low, median, high = map(float, quantiles)
         return cls(float(values.min()), low, median, high, float(values.max()))
 
     def moved(self, by: float) -> Spread:
@@ -102,10 +103,13 @@ def values_of(prepared: Prepared) -> dict[str, Any]:
     middle = np.array([[spread.median] for spread in position])
     distance = np.linalg.norm(means.astype(np.float64) - middle, axis=0)
     diagonal = float(np.linalg.norm([spread.high - spread.low for spread in position]))
-    same = means[:, np.lexsort(means)]
+    sorted_means = means[:, np.lexsort(means)]
+    repeated = sorted_means[:, 1:] == sorted_means[:, :-1]
     harmonics = prepared.arrays["shN"]
-    nonzero = [k + 1 for k in range(harmonics.shape[1]) if harmonics[:, k][keep].any()]
-    highest = max(nonzero, default=0)
+    highest = 0
+    for k in range(harmonics.shape[1]):
+        if harmonics[:, k][keep].any():
+            highest = k + 1
     return dict(
         total=len(keep),
         count=int(keep.sum()),
@@ -116,7 +120,7 @@ def values_of(prepared: Prepared) -> dict[str, Any]:
         opacity=Spread.of(opacities),
         needles=float((scales[2] > NEEDLE * scales[1]).mean()),
         infinite_opacity=int(np.isposinf(logits).sum()),
-        doubles=int((same[:, 1:] == same[:, :-1]).all(0).sum()),
+        doubles=int(repeated.all(0).sum()),
         far=int((distance > FAR * np.quantile(distance, 0.9)).sum()),
         giant=int((scales[2] > diagonal / 2).sum()) if diagonal > 0 else 0,
         fainter_than_visible=float((opacities < FAINT).mean()),

@@ -12,19 +12,17 @@ order and gradients. (A batch of scenes could share a call, but gsplat 1.5.3's p
 culls all scenes by the opacities of the first.) Culled Gaussians cost no more than Gaussians out of
 view. Nothing is gathered: rows and ids stay those of the caller.
 
-For gsplat 1.4.0 to 1.6.0, by the signature that is installed. The signatures here, for type
-checkers and readers, have the arguments of all these versions; those that not all have are
-keywords.
+For gsplat 1.4.0 to 1.6.0: the signatures are those of the installed version, and the four.
 """
 
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from inspect import Parameter
+from typing import Any, TypeVar
 
 from torch import Tensor
 
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.hook import dropped_in
 from clod_adapter.integrations.gsplat_cameras import PER_ROW, render
 
@@ -42,23 +40,19 @@ __all__ = [
     "rasterization_inria_wrapper",
 ]
 
-RenderMode = Literal["RGB", "d", "Ed", "D", "ED", "RGB-d", "RGB-Ed", "RGB+D", "RGB+ED"]
-CameraModel = Literal["pinhole", "ortho", "fisheye", "ftheta", "lidar"]
 DIAL_ARGUMENTS = {"sigma_d": None, "virtual_scale": 1.0, "attenuation": None, "growth_d": None}
 Meta = dict[str, Any]
-Typed = TypeVar("Typed", bound=Callable[..., Any])
+Documented = TypeVar("Documented", bound=Callable[..., Any])
 
 
-def _of_gsplat(typed: Typed) -> Typed:
-    """gsplat's function of the same name with the four arguments; ``typed`` has their types and
-    text.
-    """
-    name = typed.__name__
+def _of_gsplat(documented: Documented) -> Documented:
+    """gsplat's function of the same name with the four arguments."""
+    name = documented.__name__
     projection = inspect.signature(gsplat.fully_fused_projection).parameters
     # a projection that knows opacities culls those of 0 itself
     hide = not (name == "rasterization" and "opacities" in projection)
 
-    @functools.wraps(typed)
+    @functools.wraps(documented)
     def attenuated(*args: Any, **kwargs: Any) -> Any:
         function = getattr(gsplat, name)
         dial = {key: kwargs.pop(key, default) for key, default in DIAL_ARGUMENTS.items()}
@@ -71,60 +65,16 @@ def _of_gsplat(typed: Typed) -> Typed:
         arguments |= {key: dial[key] for key in PER_ROW}
         return render(function, arguments, dial["virtual_scale"], settings, hide)
 
+    parameters = [*inspect.signature(getattr(gsplat, name)).parameters.values()]
+    for key, default in DIAL_ARGUMENTS.items():
+        parameters.append(Parameter(key, Parameter.KEYWORD_ONLY, default=default))
+    parameters.sort(key=lambda parameter: parameter.kind)
+    attenuated.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return attenuated  # type: ignore[return-value]
 
 
 @_of_gsplat
-def rasterization(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    colors: Tensor | None,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    packed: bool = True,
-    tile_size: int = 16,
-    backgrounds: Tensor | None = None,
-    render_mode: RenderMode = "RGB",
-    sparse_grad: bool = False,
-    absgrad: bool = False,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    channel_chunk: int = 32,
-    distributed: bool = False,
-    camera_model: CameraModel = "pinhole",
-    *,
-    segmented: bool = False,
-    covars: Tensor | None = None,
-    with_ut: bool = False,
-    with_eval3d: bool = False,
-    return_normals: bool = False,
-    global_z_order: bool = True,
-    rays: Tensor | None = None,
-    radial_coeffs: Tensor | None = None,
-    tangential_coeffs: Tensor | None = None,
-    thin_prism_coeffs: Tensor | None = None,
-    ftheta_coeffs: Any = None,
-    lidar_coeffs: Any = None,
-    external_distortion_coeffs: Any = None,
-    rolling_shutter: Any = None,
-    viewmats_rs: Tensor | None = None,
-    ut_params: Any = None,
-    extra_signals: Tensor | None = None,
-    extra_signals_sh_degree: int | None = None,
-    renderer_config: Any = None,
-    sigma_d: Tensor | None = None,
-    virtual_scale: float = 1.0,
-    attenuation: AttenuationConfig | None = None,
-    growth_d: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Meta]:
+def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Meta]:
     """``gsplat.rasterization`` with the opacities and scales of one dial value, for each camera.
 
     Equals gsplat called with the opacities of ``attenuation.attenuate`` and ``scales`` times its
@@ -169,33 +119,7 @@ def rasterization(
 
 @_of_gsplat
 def rasterization_2dgs(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    packed: bool = False,
-    tile_size: int = 16,
-    backgrounds: Tensor | None = None,
-    render_mode: RenderMode = "RGB",
-    sparse_grad: bool = False,
-    absgrad: bool = False,
-    distloss: bool = False,
-    depth_mode: Literal["expected", "median"] = "expected",
-    *,
-    sigma_d: Tensor | None = None,
-    virtual_scale: float = 1.0,
-    attenuation: AttenuationConfig | None = None,
-    growth_d: Tensor | None = None,
+    *args: Any, **kwargs: Any
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, Meta]:
     """``gsplat.rasterization_2dgs`` with the opacities and scales of one dial value; see
     ``rasterization``.
@@ -210,28 +134,7 @@ def rasterization_2dgs(
 
 
 @_of_gsplat
-def rasterization_inria_wrapper(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 100.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,
-    *,
-    sigma_d: Tensor | None = None,
-    virtual_scale: float = 1.0,
-    attenuation: AttenuationConfig | None = None,
-    growth_d: Tensor | None = None,
-    **kwargs: Any,
-) -> tuple[Tensor, None, Meta]:
+def rasterization_inria_wrapper(*args: Any, **kwargs: Any) -> tuple[Tensor, None, Meta]:
     """``gsplat.rasterization_inria_wrapper`` with a dial; see ``rasterization``.
 
     gsplat 1.5 and 1.6 return one camera's image without the camera's dimension, and reject several;
@@ -242,27 +145,7 @@ def rasterization_inria_wrapper(
 
 @_of_gsplat
 def rasterization_2dgs_inria_wrapper(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 100.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    backgrounds: Tensor | None = None,
-    depth_ratio: int = 0,
-    *,
-    sigma_d: Tensor | None = None,
-    virtual_scale: float = 1.0,
-    attenuation: AttenuationConfig | None = None,
-    growth_d: Tensor | None = None,
-    **kwargs: Any,
+    *args: Any, **kwargs: Any
 ) -> tuple[tuple[Tensor, Tensor], Meta]:
     """``gsplat.rasterization_2dgs_inria_wrapper`` with a dial; see ``rasterization``.
 

@@ -153,9 +153,8 @@ def _joined(results: Sequence[Any], shape: torch.Size) -> Any:
         return _joined_meta(results, shape)
     if first is None:
         return None
-    images = torch.stack([result.reshape(result.shape[-3:]) for result in results]).unflatten(
-        0, shape
-    )
+    each = [result.reshape(result.shape[-3:]) for result in results]
+    images = torch.stack(each).unflatten(0, shape)
     return images.squeeze(0) if first.dim() == 3 else images  # as gsplat squeezes some
 
 

@@ -29,9 +29,8 @@ from clod_adapter.io.settings import (
     matching_calibration,
     stated_filter,
     tagged,
-    truncate_history,
 )
-from clod_adapter.io.values import SIGMA, Activated, prepared
+from clod_adapter.io.values import SIGMA, Activated, Prepared, prepared
 from clod_adapter.origin import NOWHERE, Origin
 
 # Adapted files of three captures keep 38 to 97 % at s = 1, with sigma_d in other units 3 to 43 %.
@@ -47,8 +46,7 @@ class Checkpoint:
             growth_d, if the file is extended.
         vertex: of a PLY, ``[N]`` structured array: the same rows with every column as it is in the
             file, native byte order; None for other formats.
-        comments: the header's but the settings, or the lines of history of another format; as far
-            as an output has room for them.
+        comments: the header's but the settings, or the lines of history of another format.
         notes: what was dropped or noticed, one line each.
         fingerprint: SHA-256 of the file's bytes, hex, or of those of all ranks; preceded by
             "opacity:", "scales:" or "both:" where values were taken as activated.
@@ -126,7 +124,7 @@ def load(
     (``file_formats.FORMATS``).
 
     A PLY may have Inria's, MaskGaussian's, Mip-Splatting's or our extended layout: any property
-    order, byte order or ascii, with or without normals, SH degree 0 to 4. It is read once; the
+    order, byte order or ascii, with or without normals, SH degree 0 to 3. It is read once; the
     fingerprint is of the bytes that were parsed. Of a checkpoint of several GPUs any rank stands
     for all, which lie in its folder.
 
@@ -160,7 +158,6 @@ def load(
     )
     arrays = values.arrays
     rows = source.rows
-    total = len(values.keep)
     if not values.keep.all():
         arrays = {name: array[values.keep] for name, array in arrays.items()}
         rows = None if rows is None else rows[values.keep]
@@ -169,35 +166,38 @@ def load(
     gaussians = Gaussians(
         **tensors, attenuation=metadata.attenuation if dial else None, screen_filter=screen_filter
     )
-    dropped = [
-        f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in values.dropped.items()
-    ]
-    notes = [*values.changes, *dropped]
-    if arrays["opacity_logits"].max() == np.inf:  # else no mask is made
-        opaque = np.count_nonzero(arrays["opacity_logits"] == np.inf)
-        notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
-    if any(values.origin):
-        where = ", ".join(f"{value:.10g}" for value in values.origin)
-        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
-    notes += metadata.notes
+    notes = [*_notes_of(values, arrays["opacity_logits"]), *metadata.notes]
     if gaussians.attenuation is not None and not metadata.described:
         notes += plausibility(arrays, gaussians.attenuation)
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
     about = [comment for comment in source.comments if not comment.startswith(PREFIX)]
     if source.head is None:
         about = tagged([re.sub("[^ -~]", "?", line) for line in about], screen_filter)
-    comments, cut = truncate_history([*about, *values.changes])
     return Checkpoint(
         gaussians,
         rows,
-        comments,
-        (*notes, *mismatch, *source.notes, *cut),
+        (*about, *values.changes),
+        (*notes, *mismatch, *source.notes),
         source.sha256 if values.activated == "none" else f"{values.activated}:{source.sha256}",
         path,
         calibration,
         values.origin,
         filter_known=dial or metadata.screen_filter is not None,
     )
+
+
+def _notes_of(values: Prepared, opacity_logits: np.ndarray) -> list[str]:
+    """What was changed or dropped, and what is odd about the rest, one line each."""
+    notes = [*values.changes]
+    for reason, lost in values.dropped.items():
+        notes.append(f"{lost} of {len(values.keep)} Gaussians dropped: {reason}")
+    if opacity_logits.max() == np.inf:  # else no mask is made
+        opaque = np.count_nonzero(opacity_logits == np.inf)
+        notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
+    if any(values.origin):
+        where = ", ".join(f"{value:.10g}" for value in values.origin)
+        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
+    return notes
 
 
 @torch.no_grad()

@@ -42,24 +42,25 @@ class Format(NamedTuple):
     ordered: bool = True  # whether the rows keep their order
 
 
+PACKED = ".compressed.ply"
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
-_GLB = "float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
-_SPZ = ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",)
+_GLB = "float32", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
+_SPZ = ("6 to 24 bits, the dial 16-bit floats",)
 _CONVERTED = Format("formats.splat_transform", "formats.splat_transform.check")
 PLY = Format("ply", "ply.has_dial", carries_sigma=True, about=("exact; baked, in Inria's layout",))
 FORMATS = {
     ".ply": PLY,
     ".glb": Format("formats.glb", carries_sigma=True, about=_GLB),
     ".spz": Format("formats.spz", carries_sigma=True, about=_SPZ),
-    ".safetensors": Format("tensor_file", carries_sigma=True, about=("exact; for Python",)),
     ".pt": Format(
         "formats.pt",
         "formats.pt.check",
         carries_sigma=True,
         about=("exact; layout of gsplat's trainer",),
     ),
-    ".splat": Format("formats.splat", about=("8 bits, SH degree 0",), ordered=False),
+    PACKED: _CONVERTED,
     ".sog": _CONVERTED,
+    ".splat": _CONVERTED,
     ".ksplat": _CONVERTED,
 }
 WRITABLE = tuple(suffix for suffix, form in FORMATS.items() if form.about)
@@ -69,6 +70,8 @@ def format_of(path: Path) -> Format:
     """The format of a file, by its name alone, so that only a .pt is unpickled; any other name is a
     PLY's.
     """
+    if path.name.lower().endswith(PACKED):
+        return FORMATS[PACKED]
     return FORMATS.get(path.suffix.lower(), PLY)
 
 
@@ -86,7 +89,7 @@ def file_has_dial(path: Path) -> bool:
 
 def check_suffix(path: Path) -> None:
     """Rejects a name whose suffix is none of WRITABLE."""
-    if path.name.lower().endswith((".sog", ".compressed.ply")):
+    if path.name.lower().endswith((".sog", PACKED)):
         raise ClodError(
             f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it"
         )
@@ -153,10 +156,6 @@ def write(
         raise ClodError(
             f"{path}: there are no Gaussians to write, and no reader takes a file without any"
         )
-    if gaussians.sigma_d is not None and not form.carries_sigma:
-        raise ClodError(
-            f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake"
-        )
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
 
     g = in_world_units(gaussians)
@@ -185,16 +184,6 @@ def check_start(path: Path) -> None:
         reject(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
         _call("formats.splat_transform.check", path)
-    # a .splat has no header: other files are known by their size, and a PLY by its first bytes
-    if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):
-        reject(
-            path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again"
-        )
-    header = _call("tensor_file.read_tensor_header", path)[1] if suffix == ".safetensors" else {}
-    if '"clod-adapter"' in header.get(KEY, ""):
-        raise ClodError(
-            f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply"
-        )
 
 
 def _call(function: str, *args: Any) -> Any:
@@ -235,6 +224,10 @@ OTHERS: dict[str | bytes, tuple[str, str]] = {
     ".pth": (
         "a trainer's checkpoint, such as Inria's",
         "use the point_cloud/iteration_N/point_cloud.ply beside it",
+    ),
+    ".safetensors": (
+        "no model but perhaps an adapter",
+        "clod-adapt apply BASE.ply ADAPTER.safetensors -o OUT.ply makes a model of it",
     ),
     ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
     b"\x1f\x8b": ("compressed with gzip", "unpack it first: gunzip"),

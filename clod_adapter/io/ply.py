@@ -1,6 +1,6 @@
 """PLY files of Gaussians, by plyfile: headers, and reading.
 
-Any property order, byte order or ascii; plain, or PlayCanvas's compressed layout (``ply_packed``).
+Any property order, byte order or ascii.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io import file_formats
-from clod_adapter.io.ply_layout import RGB, column_map, is_coloured, ply_metadata, with_harmonics
+from clod_adapter.io.ply_layout import column_map, ply_metadata
 from clod_adapter.io.ply_layout import write as write
-from clod_adapter.io.ply_packed import NOTE, check_packed, column_types, is_packed, unpack
 from clod_adapter.io.settings import Source, of_another_method
 from clod_adapter.io.values import (
     FILTER_3D,
@@ -40,10 +39,6 @@ _LONGEST = 1 << 20  # characters of a row of text
 _PREFIXED = rb"(?<=[\r\n])(property[ \t]+\w+[ \t]+)(?:scal(?:ar)?_)+"
 UNPREFIXED = (
     "saved by CloudCompare: its properties are read, and written, without the prefix scalar_"
-)
-COLOURED = (
-    "its colours are red, green, blue in 8 bits, read as SH degree 0; for all harmonics export it"
-    " again by ns-export gaussian-splat --ply-color-mode sh_coeffs"
 )
 
 
@@ -122,16 +117,8 @@ def read(path: Path, data: bytes) -> Source:
     _check_length(path, head, len(data))
     with rejected_if_damaged(path):
         elements = _elements(data, head)
-    if is_packed(head.ply):
-        metadata = ply_metadata(path, head.comments, dial=False)
-        return Source(
-            unpack(path, elements, degree), metadata, (*head.notes, NOTE), head.comments, head=head
-        )
     rows = elements["vertex"]
     notes = [*head.notes, *of_another_method(rows.dtype.names or ())]
-    if is_coloured(rows.dtype.names or ()):
-        rows = with_harmonics(rows)
-        notes.append(COLOURED)
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, head.comments, rows, dial=SIGMA in arrays)
     lost = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
@@ -181,7 +168,9 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     groups = column_map(sh_degree) | dial_columns(names)
     groups |= {MASKS: MASK_COLUMNS} if set(MASK_COLUMNS) <= set(names) else {}
     groups |= {FILTER_3D: (FILTER_3D,)} if FILTER_3D in names else {}
-    arrays: Arrays = {key: np.empty((len(rows), len(group)), "f4") for key, group in groups.items()}
+    arrays: Arrays = {}
+    for key, group in groups.items():
+        arrays[key] = np.empty((len(rows), len(group)), "f4")
     if any(rows.dtype[name].itemsize == 8 for name in "xyz"):
         arrays["means"] = np.empty((len(rows), 3))
     with np.errstate(over="ignore", invalid="ignore"):  # invalid: a NaN that signals
@@ -220,12 +209,18 @@ def _check_length(path: Path, head: Head, length: int) -> None:
         )
 
 
+def column_types(element: PlyElement) -> dict[str, str]:
+    """The types of the properties by name; "list" of a list."""
+    types = {}
+    for column in element.properties:
+        types[column.name] = "list" if isinstance(column, PlyListProperty) else column.val_dtype
+    return types
+
+
 def sh_degree_of(path: Path, header: PlyData) -> int:
     """The SH degree of a checkpoint with this header; rejects something else, and missing
     columns.
     """
-    if is_packed(header):
-        return check_packed(path, header)
     if "vertex" not in header:
         names = ", ".join(element.name for element in header) or "none"
         raise ClodError(
@@ -233,6 +228,11 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
             " layout"
         )
     types = column_types(header["vertex"])
+    if any(name.startswith("packed_") for name in types):
+        raise ClodError(
+            f"{path}: is a compressed PLY; call it {path.stem}.compressed.ply, as which it is read"
+            " through splat-transform"
+        )
     anchors = [name for name in types if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)]
     if anchors:
         raise ClodError(
@@ -250,8 +250,11 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
             f"{path}: has no property scale_2, so this is a 2DGS file of flat disks; use a 3DGS"
             " checkpoint"
         )
-    if is_coloured(types) and all(types[name] == "u1" for name in RGB):
-        types |= dict.fromkeys(column_map(0)["sh0"], "f4")
+    if "red" in types and "f_dc_0" not in types:
+        raise ClodError(
+            f"{path}: has colours in the place of f_dc_0, f_dc_1, f_dc_2; export it again by"
+            " ns-export gaussian-splat --ply-color-mode sh_coeffs"
+        )
     higher = [name for name in types if re.fullmatch(r"f_rest_\d+", name)]
     degree = degree_of(path, len(higher))
     for name in chain(*column_map(degree).values()):

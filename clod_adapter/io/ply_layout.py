@@ -8,7 +8,7 @@ columns in a constant float column too, whose name begins with ``clod_``, before
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, astuple, fields, replace
 from itertools import product
 from pathlib import Path
@@ -31,7 +31,6 @@ from clod_adapter.io.values import (
     arrays_of,
     dial_columns,
     hidden,
-    sh0_of,
 )
 
 if TYPE_CHECKING:
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
 
 PREFIX = "clod_adapter "
 COLUMN = "clod_"
-RGB = ("red", "green", "blue")
 # Comments of the calibration: machine; total, views, width, height, reference; one for each row and
 # each viewpoint.
 MACHINE = "calibrated_on"
@@ -73,27 +71,6 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
         "sh0": tuple(f"f_dc_{c}" for c in range(3)),
         "shN": tuple(f"f_rest_{c * bands + k}" for k, c in product(range(bands), range(3))),
     }
-
-
-def is_coloured(names: Container[str]) -> bool:
-    """Whether RGB stands for the harmonics, as ``ns-export gaussian-splat --ply-color-mode rgb``
-    writes it.
-    """
-    if "f_dc_0" in names or "f_rest_0" in names:
-        return False
-    return all(name in names for name in (*RGB, "scale_0"))
-
-
-def with_harmonics(rows: np.ndarray) -> np.ndarray:
-    """The rows with f_dc in the place of RGB."""
-    names = {
-        name: f"f_dc_{RGB.index(name)}" if name in RGB else name for name in rows.dtype.names or ()
-    }
-    kinds = [(new, "f4" if old in RGB else rows.dtype[old]) for old, new in names.items()]
-    harmonic_rows = np.empty(len(rows), kinds)
-    for old, new in names.items():
-        harmonic_rows[new] = sh0_of(rows[old]) if old in RGB else rows[old]
-    return harmonic_rows
 
 
 def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
@@ -160,7 +137,10 @@ def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
         "rows": _by_field(CalibrationRow, stored.pop(ROW, [])),
         "viewpoints": _by_field(Viewpoint, stored.pop(VIEWPOINT, [])),
     }
-    settings = {name: " ".join(lines[-1]) for name, lines in stored.items() if lines[-1]}
+    settings = {}
+    for name, lines in stored.items():
+        if lines[-1]:
+            settings[name] = " ".join(lines[-1])
     extent = settings.pop(EXTENT, "").split(maxsplit=4)
     measured |= zip(("total", "views", "width", "height", "against"), extent, strict=False)
     if MACHINE in settings:
@@ -279,12 +259,8 @@ def write_rows(
                 values = values.reshape(len(block), -1)
                 for k, name in enumerate(group):
                     shift = origin[k] if attribute == "means" else 0.0
-                    new = values[:, k]
-                    changed = np.ones(len(block), bool)
-                    if base is not None and name not in dial:
-                        old = (block[name] - shift if shift else block[name]).astype(np.float32)
-                        changed = new.view(np.uint32) != old.view(np.uint32)
-                    new = new[changed]
+                    is_stored = base is not None and name not in dial
+                    new = _overwrite(block[name], values[:, k], shift, is_stored)
                     usable = np.isfinite(new)
                     if attribute == "opacity_logits" and base is None:
                         usable |= new == np.inf
@@ -293,6 +269,18 @@ def write_rows(
                         raise ClodError(
                             f"{path}: {attribute} holds a new value that is not finite; {fix}"
                         )
-                    block[name][changed] = new.astype(np.float64) + shift if shift else new
             file.write(block.astype(kind.newbyteorder("<"), copy=False).data)
     return ()
+
+
+def _overwrite(column: np.ndarray, values: np.ndarray, shift: float, is_stored: bool) -> np.ndarray:
+    """Puts values, plus ``shift``, into a column, of one that ``is_stored`` where they are not its
+    own; returns the new ones.
+    """
+    changed = np.ones(len(column), bool)
+    if is_stored:
+        old = (column - shift if shift else column).astype(np.float32)
+        changed = values.view(np.uint32) != old.view(np.uint32)
+    new = values[changed]
+    column[changed] = new.astype(np.float64) + shift if shift else new
+    return new

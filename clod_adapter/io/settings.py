@@ -48,9 +48,6 @@ EARLIER_FORM = (
     "its dial is of an earlier form, which is not read any more; adapt its checkpoint again with"
     " clod-adapt"
 )
-# bytes of history that an output inherits; a PLY header must have room for them
-_INHERITED = 60_000
-_OVERHEAD = 9  # bytes of a PLY's comment besides its text
 
 
 @dataclass(frozen=True)
@@ -182,24 +179,6 @@ def of_another_method(names: Iterable[str]) -> list[str]:
                 " one; adapt a checkpoint of plain Gaussians"
             )
     return lines
-
-
-def truncate_history(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The lines of a file's history that every output has room for, the last ones first; and a note
-    on the others.
-    """
-    fitting: list[str] = []
-    room = _INHERITED
-    for line in reversed(lines):
-        if len(line) + _OVERHEAD <= room:
-            fitting.append(line)
-            room -= len(line) + _OVERHEAD
-    left_out_count = len(lines) - len(fitting)
-    note = (
-        f"{left_out_count} of {len(lines)} comments are not carried over to outputs, which hold"
-        f" {_INHERITED:,} characters"
-    )
-    return tuple(reversed(fitting)), (note,) if left_out_count else ()
 
 
 def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | None, list[str]]:

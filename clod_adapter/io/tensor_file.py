@@ -1,9 +1,4 @@
-"""Safetensors files: tensors and metadata; and whole models as such files, every value unchanged.
-
-A model has the tensors of ``Gaussians`` by their names there, float32. The metadata key
-``clod_adapter`` holds the JSON document (``settings.document``), whose format distinguishes a model
-from an adapter.
-"""
+"""Safetensors files: tensors and metadata."""
 
 from __future__ import annotations
 
@@ -16,15 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from safetensors import safe_open
 
-from clod_adapter.errors import ClodError, rejected_if_damaged
-from clod_adapter.io.file_formats import KEY, START, read_bytes, reject_known
-from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
-from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
+from clod_adapter.errors import rejected_if_damaged
+from clod_adapter.io.file_formats import START, read_bytes, reject_known
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from clod_adapter.gaussians import Gaussians
 
 _DAMAGED = "is not a safetensors file, or damaged", "copy or export it again"
 
@@ -35,7 +26,9 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     safetensors' ``save`` holds all of it in memory; ``save_file`` takes names in UTF-8 only, and
     makes files that only their owner can read.
     """
-    arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
+    arrays = {}
+    for name, tensor in tensors.items():
+        arrays[name] = tensor.detach().cpu().contiguous().numpy()
     header: dict[str, Any] = {"__metadata__": dict(metadata)}
     at = 0
     names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
@@ -89,40 +82,3 @@ def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
 def _name_of(file: BufferedReader) -> str:
     """A name of an open file, in UTF-8 as safetensors takes it."""
     return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
-
-
-def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
-    """Writes every value unchanged."""
-    arrays_of(path, gaussians)  # rejects rows that load would drop
-    tensors = {name: tensor.float() for name, tensor in gaussians.tensors().items()}
-    write_tensors(path, tensors, {KEY: document(MODEL, metadata)})
-    return ()
-
-
-def has_dial(path: Path) -> bool:
-    """Whether one of the tensors is sigma_d."""
-    return SIGMA in read_tensor_header(path)[0]
-
-
-def read(path: Path, data: bytes) -> Source:
-    """Reads a model."""
-    from clod_adapter.adapter import ATTRIBUTES
-
-    tensors, stored = parse_tensors(path, data)
-    if KEY not in stored:
-        raise ClodError(
-            f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it"
-            " wrote"
-        )
-    metadata = parse_metadata(path, stored[KEY], dial=SIGMA in tensors)
-    names = (*ATTRIBUTES, *dial_columns(tensors))
-    for name in ATTRIBUTES:
-        if name not in tensors:
-            raise ClodError(f"{path}: has no tensor {name!r}; export it again")
-    for name in names:
-        if not tensors[name].is_floating_point():
-            raise ClodError(
-                f"{path}: tensor {name!r} is not of floating-point numbers; export it again"
-            )
-    arrays = {name: tensors[name].float().numpy() for name in names}
-    return Source(arrays, metadata, comments=metadata.about)

@@ -285,34 +285,18 @@ def _on_the_host(tensors: Mapping[str, Tensor]) -> Arrays:
     }
 
 
-def dropped_harmonics(arrays: Arrays, degree: int) -> tuple[str, ...]:
-    """A line where the harmonics above a degree, which a format does not store, are not 0."""
-    lost = arrays["shN"][:, SH_COUNTS[degree] - 1 :].any()
-    return (f"spherical harmonics above degree {degree} are dropped",) if lost else ()
-
-
-def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:
-    """The Gaussians under a half turn about ``x`` or ``z``, between axes with y down and with y up.
+def half_turn(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The Gaussians under a half turn about z, between axes with y down and with y up.
 
     Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations
-    ``P R P``, which gives the same ellipsoids, and harmonics change sign where they are odd in an
-    odd number of the axes that flip.
+    ``P R P``, which gives the same ellipsoids, and harmonics of an odd order change sign.
     """
-    x, y, z = (np.float32(1 if name == axis else -1) for name in "xyz")
-    # A harmonic is odd in y for a negative order, in x for an odd one (else an even one), in z
-    # where degree and order differ by an odd number.
-    harmonics = []
-    for degree in range(1, 5):
-        for order in range(-degree, degree + 1):
-            odd_in_y = int(order < 0)
-            odd_in_x = (abs(order) - odd_in_y) % 2
-            odd_in_z = (degree - order) % 2
-            harmonics.append(x**odd_in_x * y**odd_in_y * z**odd_in_z)
+    harmonics = [(-1) ** order for degree in range(1, 4) for order in range(-degree, degree + 1)]
     bands = arrays["shN"].shape[1]
     return {
         **arrays,
-        "means": arrays["means"] * np.array([x, y, z], np.float32),
-        "quats": arrays["quats"] * np.array([1, x, y, z], np.float32),
+        "means": arrays["means"] * np.array([-1, -1, 1], np.float32),
+        "quats": arrays["quats"] * np.array([1, -1, -1, 1], np.float32),
         "shN": arrays["shN"] * np.array(harmonics[:bands], np.float32)[:, None],
     }
 
@@ -360,18 +344,6 @@ def colours_of(sh0: np.ndarray, opacities: np.ndarray) -> np.ndarray:
     return bytes_of(255 * np.concatenate([colours, opacities[:, None]], 1))
 
 
-def sh0_of(levels: np.ndarray) -> np.ndarray:
-    """Float32 harmonics of degree 0 of colours in 255ths."""
-    return (levels.astype(np.float32) / 255 - 0.5) / _SH_C0
-
-
 def bytes_of(values: np.ndarray) -> np.ndarray:
     """Levels of 0 to 255, rounded."""
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
-
-
-def logits_of_bytes(levels: np.ndarray) -> np.ndarray:
-    """Finite logits of opacities in 255ths: the first and last level are a quarter of a level from
-    0 and 1.
-    """
-    return logit(np.clip(levels.astype(np.float64), 0.25, 254.75) / 255)

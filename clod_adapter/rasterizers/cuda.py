@@ -232,4 +232,5 @@ class _Rows(Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor]:
         (rows,) = ctx.saved_tensors
-        return None, grad.new_zeros(ctx.shape).index_copy_(0, rows, grad.nan_to_num(0.0, 0.0, 0.0))
+        finite = grad.nan_to_num(0.0, 0.0, 0.0)
+        return None, grad.new_zeros(ctx.shape).index_copy_(0, rows, finite)

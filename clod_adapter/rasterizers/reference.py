@@ -102,7 +102,8 @@ def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tup
     covariance = half @ half.transpose(1, 2) + screen_filter.variance * torch.eye(2).to(half)
     if not screen_filter.compensate:
         return covariance, opacities
-    unblurred = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
+    normal = torch.linalg.cross(half[:, 0], half[:, 1])
+    unblurred = normal.square().sum(1)
     ratio = unblurred / torch.linalg.det(covariance)
     has_area = ratio > 0  # the derivative of the square root at 0 is infinite
     compensated = opacities * ratio.where(has_area, 1).sqrt().where(has_area, 0)
@@ -112,7 +113,8 @@ def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tup
 def blend(alphas: Tensor) -> tuple[Tensor, Tensor]:
     """Front-to-back weights ``[pixels, n]`` and the remaining transmittance ``[pixels]``."""
     through = torch.cumprod(1 - alphas, 1)
-    before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], 1)
+    first = torch.ones_like(through[:, :1])
+    before = torch.cat([first, through[:, :-1]], 1)
     alive = before > T_MIN
     weights = torch.where(alive, alphas * before, 0)
     return weights, torch.where(alive, 1 - alphas, 1).prod(1)
@@ -128,7 +130,7 @@ def shade(means: Tensor, sh0: Tensor, shN: Tensor, eye: Tensor) -> Tensor:
 
 
 def sh_basis(directions: Tensor) -> Tensor:
-    """The 25 real spherical harmonics up to degree 4 of unit ``directions [n, 3]``, order and signs
+    """The 16 real spherical harmonics up to degree 3 of unit ``directions [n, 3]``, order and signs
     of 3DGS.
     """
     x, y, z = directions.unbind(1)
@@ -156,15 +158,6 @@ def sh_basis(directions: Tensor) -> Tensor:
             -0.4570457994644658 * x * (4 * zz - xx - yy),
             1.445305721320277 * z * (xx - yy),
             -0.5900435899266435 * x * (xx - 3 * yy),
-            2.5033429417967046 * xy * (xx - yy),
-            -1.7701307697799304 * yz * (3 * xx - yy),
-            0.9461746957575601 * xy * (7 * zz - 1),
-            -0.6690465435572892 * yz * (7 * zz - 3),
-            0.10578554691520431 * (zz * (35 * zz - 30) + 3),
-            -0.6690465435572892 * xz * (7 * zz - 3),
-            0.47308734787878004 * (xx - yy) * (7 * zz - 1),
-            -1.7701307697799304 * xz * (xx - 3 * yy),
-            0.6258357354491761 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
         ],
         1,
     )

@@ -57,6 +57,13 @@ COLUMN = 2.4  # width of a column of the legend, inches
 LINE = 0.19  # height of a line of the legend, inches
 MARKERS = "oDs^vPX"
 ROOM = (38, 11)  # points that a label takes
+# steps of a decade, the coarsest series first
+TICK_SERIES: tuple[Sequence[float], ...] = (
+    (1,),
+    (1, 2, 5),
+    (1, 1.5, 2, 3, 4, 5, 7),
+    tuple(k / 10 for k in range(10, 100)),
+)
 FEWEST_TICKS = 3
 MOST_TICKS = 9
 BASE = "base, unadapted"
@@ -235,7 +242,7 @@ def _finish(axes: Any, label: str) -> None:
     axes.set_yticks(_round_errors(*axes.get_ylim()))
     axes.yaxis.set_major_formatter(lambda psnr, _: f"{1e3 * error(psnr):.3g}")
     near, far = axes.get_xlim()
-    subs = (1, 2, 5) if far / near > 20 else (1, 1.5, 2, 3, 4, 5, 7)
+    subs = TICK_SERIES[1] if far / near > 20 else TICK_SERIES[2]
     label_log(axes.xaxis, "{:,g}", subs)
     # above the axes it covers nothing
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_columns(axes), borderaxespad=0)
@@ -249,7 +256,7 @@ def _round_errors(low: float, high: float) -> list[float]:
     low, high = sorted((low, high))
     decades = range(math.floor(-high / 10), math.ceil(-low / 10) + 1)
     ticks = list[float]()
-    for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7), [k / 10 for k in range(10, 100)]):
+    for steps in TICK_SERIES:
         every = (-10 * math.log10(step) - 10 * decade for decade, step in product(decades, steps))
         ticks = [psnr for psnr in every if low <= psnr <= high]
         if len(ticks) >= FEWEST_TICKS:

@@ -37,14 +37,13 @@ class Picture:
     def url(self) -> str:
         """The image as WebP in a data: URL, at most WIDEST pixels wide."""
         image = self.image
+        if image.dtype != np.uint8:
+            image = (image.clip(0, 1) * 255).round().astype("u1")
         file = io.BytesIO()
-        picture = Image.fromarray(
-            image if image.dtype == np.uint8 else (image.clip(0, 1) * 255).round().astype("u1")
-        )
+        picture = Image.fromarray(image)
         if picture.width > WIDEST:
-            picture = picture.resize(
-                (WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS
-            )
+            height = round(picture.height * WIDEST / picture.width)
+            picture = picture.resize((WIDEST, height), Image.Resampling.LANCZOS)
         picture.save(file, "WEBP", quality=QUALITY)
         return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 

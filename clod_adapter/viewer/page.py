@@ -92,7 +92,8 @@ class Payload:
         """The PLY's header, with attenuation settings and calibration as comments."""
         g = self.gaussians
         names = inria_dtype(g.sh_degree, dial=dial_columns(g.tensors())).names or ()
-        row = np.zeros((), [(name, "<f4") for name in names if name not in ("nx", "ny", "nz")])
+        columns = [(name, "<f4") for name in names if name not in ("nx", "ny", "nz")]
+        row = np.zeros((), columns)
         settings = Metadata(g.attenuation, g.screen_filter, self.calibration, about=self.about)
         comments = write_comments(settings)
         element = PlyElement.describe(np.broadcast_to(row, len(g)), "vertex", comments=comments)

@@ -18,7 +18,7 @@ from PIL import Image
 import clod_adapter
 from clod_adapter.cli.main import COMMANDS, build_parser, command_of
 from clod_adapter.cli.shared.outputs import claimed
-from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
+from clod_adapter.io.file_formats import WRITABLE, write
 from runs import contents
 
 
@@ -46,8 +46,9 @@ def folder(capture, attenuated, tmp_path_factory):
         shutil.copy(attenuated.with_suffix(suffix), there / f"dial{suffix}")
     bare = clod_adapter.with_dial(capture.gaussians)
     for suffix in WRITABLE:
-        write(there / f"bare{suffix}", bare if FORMATS[suffix].carries_sigma else capture.gaussians)
+        write(there / f"bare{suffix}", bare)
     (there / "text.ply").write_text("hello")
+    (there / "dial.html").write_text("<title>dial, adaptation report</title>")
     (there / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
     (there / "mesh.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
@@ -148,12 +149,12 @@ ERRORS = [
     ],
     ("export bare.ply -o x", "x: --out must end in one of .ply, .*, which is the format"),
     (
-        "export bare.ply -o x.splat",
-        "x.splat: .splat cannot store a dial; choose a dial value .* format .*.ply",
+        "export bare.ply -o x.sog",
+        "x.sog: .sog cannot store a dial; choose a dial value .* format .*.ply",
     ),
     (
-        "export bare.ply -o x.splat --sv 2 --order extinction",
-        "x.splat: .splat sorts the Gaussians itself",
+        "export bare.ply -o x.sog --sv 2 --order extinction",
+        "x.sog: .sog sorts the Gaussians itself",
     ),
     ("export bare.ply -o x.ply --sv 2 --levels 1,2", "--levels: not allowed with argument --sv"),
     (
@@ -230,7 +231,11 @@ ERRORS = [
         "out/cells/base_base.json~base.ply",
     ),
     # Files of adapting beside the input, which are named for something else.
-    ("export link.ply -o dial.safetensors", f"dial.safetensors: {BESIDE}", "link.ply>dial.ply"),
+    (
+        "export link.ply -o dial.html",
+        f"dial.html: {BESIDE}",
+        "link.ply>dial.ply",
+    ),
     # Names that follow from others, where a file is that another program wrote.
     (f"base.ply {TINY} -o out.ply", f"out.json: {FOREIGN}", "out.json"),
     (f"base.ply {TINY} --report -o out.ply", f"out_rendering.png: {FOREIGN}", "out_rendering.png"),
@@ -268,7 +273,7 @@ def outputs_of(line):
 @pytest.mark.parametrize(
     "first, second, said",
     [
-        (f"base.ply {TINY} -o two.ply", "export dial.ply -o two.safetensors", "two.safetensors"),
+        (f"base.ply {TINY} -o two.ply", "export dial.ply -o two.ply", "two.ply"),
         (
             f"base.ply {TINY} -o two.ply --report",
             "eval dial.ply --images scene --report two.html",
@@ -296,7 +301,7 @@ def test_earlier_outputs_are_replaced(clod, attenuated, tmp_path):
     (tmp_path / "out.ply").write_bytes(b"foreign, but named")
     twice = (
         "render DIAL --images SCENE -o pictures",
-        "export DIAL -o x.safetensors",
+        "export DIAL -o x.pt",
         "export DIAL -o x.spz --levels 1,2",
     )
     for line in ("BASE --images SCENE --iters 2 --max-sv 2 -o out.ply", *twice, *twice):

@@ -178,32 +178,31 @@ def test_a_lower_sh_degree_is_fitted(clod, capture):
     assert "has degree 1, and stays as it is" in clod("export x.ply --sh-degree 2 -o y.ply").err
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".glb", ".splat"])
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".pt"])
 def test_formats(clod, attenuated, suffix):
     model = load(attenuated)
-    kept = suffix != ".splat"
-    done = clod(EXPORT, f"-o x{suffix}", "" if kept else "--sv 1")
+    done = clod(EXPORT, f"-o x{suffix}")
     output = done.output
     again = load(f"x{suffix}")
-    assert output["bytes"] == Path(f"x{suffix}").stat().st_size and ("lossy" in done.err) != kept
-    assert output["virtual_scale"] == (None if kept else 1) and (output["count"] == 300 or not kept)
-    assert (again.gaussians.sigma_d is not None) == (again.gaussians.growth_d is not None) == kept
+    assert output["bytes"] == Path(f"x{suffix}").stat().st_size and "lossy" not in done.err
+    assert output["virtual_scale"] is None and output["count"] == 300
+    assert again.gaussians.sigma_d is not None and again.gaussians.growth_d is not None
     if suffix == ".ply":
         assert again.gaussians == model.gaussians and again.notes == ()
         assert again.calibration == model.calibration
-    clod(EXPORT, f"--sv 2 -o baked{suffix}")
+    assert "lossy" in clod(EXPORT, f"--sv 2 -o baked{suffix}").err
     clod(f"export baked{suffix} -o again.ply")
     header = Path("again.ply").read_bytes().partition(b"end_header")[0].decode()
-    assert header.count("comment baked at s = 2 by clod-adapter for 8 training cameras\n") == kept
+    assert "comment baked at s = 2 by clod-adapter for 8 training cameras\n" in header
 
 
 def test_losses_are_noted(clod, attenuated):
     """Harmonics and foreign columns; positions far from 0 become doubles. Columns of settings are
     not dropped.
     """
-    done = clod("export BASE -o x.splat --json")
-    wanted = {"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}
-    assert done.output == wanted and done.note("view-dependent colour is dropped")
+    done = clod("export BASE -o x.spz --json")
+    wanted = {"file": "x.spz", "virtual_scale": None, "count": 300}
+    assert wanted.items() <= done.output.items() and done.note("about 8 bits")
     model = load(attenuated)
     element = PlyData.read(str(attenuated), mmap=False)["vertex"]
     labelled = with_columns(element.data, label=7)

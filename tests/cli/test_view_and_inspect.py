@@ -111,8 +111,7 @@ def test_a_plain_file_fits_on_a_screen(clod, capture):
     lines = done.out.splitlines()
     assert len(lines) <= 24 and max(map(len, lines[1:])) <= 120 and done.err == ""
     assert lines[0].startswith(f"{capture.ply} (")
-    assert lines[2].startswith("looks like   Inria's trainer")
-    assert lines[3] == "Gaussians    300" and "dial         none: no sigma_d" in lines
+    assert lines[2] == "Gaussians    300" and "dial         none: no sigma_d" in lines
     titles = ["least", "1", "%", "median", "99", "%", "greatest"]
     at = next(k for k, line in enumerate(lines) if line.split() == titles)
     table = lines[at : at + 6]
@@ -138,15 +137,3 @@ def test_a_dial_and_its_calibration(clod, attenuated):
     clod("export DIAL --sv 2 -o x.ply")
     comment = "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n"
     assert comment in clod("inspect x.ply").out
-
-
-def test_adapter(clod):
-    text = clod("inspect ADAPTER").out
-    about = clod("inspect ADAPTER --json").report["about"]
-    assert "an adapter" in text
-    assert "with SHA-256 " in text
-    assert "max_sv 4" in text
-    assert "\ngrowth_d " in text
-    assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(about["growth"]) == 5
-    assert about["updates"] == {}
-    assert about["count"] == 540 and about["config"]["iters"] == 12

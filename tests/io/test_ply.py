@@ -7,16 +7,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 from plyfile import PlyElement
 from refusals import refused
 from torch.testing import assert_close
 
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
-from clod_adapter.gaussians import SH_C0
-from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import Checkpoint, load, save
-from clod_adapter.io.ply import COLOURED, UNPREFIXED
+from clod_adapter.io.ply import UNPREFIXED
 from formats import examples, model, needed, random_rows, resaved, write_elements, write_rows
 from scenes import seeded
 
@@ -36,7 +34,7 @@ def read_back(path):
 
 @st.composite
 def files(draw):
-    degree = draw(st.integers(0, 4))
+    degree = draw(st.integers(0, 3))
     names = needed(degree)
     names += ["nx", "ny", "nz"] if draw(st.booleans()) else []
     names += draw(
@@ -255,16 +253,3 @@ def test_columns_with_the_prefix_of_cloudcompare(tmp_path, order, prefix):
     assert found.vertex.dtype.names == plain.vertex.dtype.names
     assert found.notes == (UNPREFIXED,)
     assert resaved(found).vertex.dtype == plain.vertex.dtype
-
-
-def test_rgb_of_nerfstudio(tmp_path):
-    """Colours stand in the place of harmonics, which outputs have."""
-    columns = [*needed()[:3], "red", "green", "blue", *needed()[6:], "label"]
-    rows = random_rows(5, columns, types=dict.fromkeys(("red", "green", "blue"), "u1"))
-    rows["red"] = [0, 51, 102, 204, 255]
-    found = load(write_rows(tmp_path / "in.ply", rows))
-    assert found.gaussians.sh_degree == 0 and found.notes == (COLOURED,)
-    assert_allclose(0.5 + SH_C0 * found.gaussians.sh0[:, 0, 0], [0, 0.2, 0.4, 0.8, 1], atol=1e-6)
-    again = resaved(found)
-    assert again.gaussians == found.gaussians and again.vertex.dtype.names == (*needed(), "label")
-    assert inspect(tmp_path / "in.ply").splat.extra == ("label",)

@@ -135,7 +135,7 @@ SHAPES = {
     "quats": (4,),
     "opacity_logits": (),
     "sh0": (1, 3),
-    "shN": (24, 3),
+    "shN": (15, 3),
     "none": (0, 3),
 }
 TENTHS = dict.fromkeys(SHAPES, 0.1)

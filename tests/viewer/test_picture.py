@@ -161,14 +161,14 @@ def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, 
     """They are shown as ``clod-adapt view`` shows them; none remains; errors are one line."""
     for name, saved in (
         ("a b&.glb", gaussians),
-        ("a.splat", plain),
-        ("a.safetensors", gaussians),
         ("a.pt", plain),
+        ("b.spz", plain),
     ):
         write(tmp_path / name, finer(saved, 2.0))
     rows = PlyData.read(model, mmap=False)
     rows.text = True
     rows.write(tmp_path / "ascii.ply")
+    splat_transform("--version")
     shutil.copy(PACKED, tmp_path)
     folder = tmp_path / "temporary"
     folder.mkdir()

@@ -75,7 +75,6 @@ _STRAY = 0.01  # the largest share of values beyond the extension's range that a
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes with float32's rounding of the activations."""
     arrays = arrays_of(path, gaussians)
-    degree = min(gaussians.sh_degree, DEGREE)
     sh0 = arrays["sh0"].reshape(-1, 3)
     opacities = values.sigmoid(arrays["opacity_logits"]).astype(np.float32)
     columns: dict[str, np.ndarray] = {
@@ -88,7 +87,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         f"{EXTENSION}:OPACITY": opacities,
         harmonics(0)[0]: sh0,
     }
-    for k, name in enumerate(harmonics(degree)[1:]):
+    for k, name in enumerate(harmonics(gaussians.sh_degree)[1:]):
         columns[name] = np.ascontiguousarray(arrays["shN"][:, k])
     columns |= {DIAL_ATTRIBUTES[name]: arrays[name] for name in dial_columns(arrays)}
     accessors: dict[str, dict[str, Any]] = {}
@@ -108,7 +107,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     extras = {KEY: json.loads(document(MODEL, metadata))}
     buffers = [array.data for array in columns.values()]
     write_points(path, gaussians.means, accessors, node, views, buffers, extras=extras)
-    return values.dropped_harmonics(arrays, DEGREE)
+    return ()
 
 
 def write_points(
@@ -220,7 +219,7 @@ def read(path: Path, data: bytes) -> Source:
         arrays["shN"] = np.stack(coefficients, 1)
     stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
-    stored = stored if turned else half_turn(stored, "z")
+    stored = stored if turned else half_turn(stored)
     if scale != 1:
         if SIGMA in arrays:
             raise ClodError(f"{path}: its node scales a dial by {scale:g}; take the scale away")

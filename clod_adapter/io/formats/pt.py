@@ -116,7 +116,9 @@ def read(path: Path, data: bytes) -> Source:
             " export a PLY"
         )
     names = (*NAMES, *dial_columns(splats))
-    arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in names}
+    arrays = {}
+    for name in names:
+        arrays[NAMES.get(name, name)] = _values(path, name, splats, len(data))
     metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)
     notes = [] if metadata.described else [FRAME]
     for name, (correction, remedy) in _CORRECTIONS.items():

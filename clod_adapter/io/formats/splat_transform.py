@@ -147,11 +147,10 @@ def check(path: Path) -> SplatTransform:
     try:
         return SplatTransform.find()
     except ClodError as error:
-        # earlier ones are read here
-        version = " of version 4" if path.suffix.lower() == ".spz" else ""
-        needed = f"{path.suffix}{version} is read through splat-transform ({error})"
+        kind = "SPZ of another version than 3" if path.suffix.lower() == ".spz" else "this format"
         raise ClodError(
-            f"{path}: {needed}; better still, adapt the PLY that it was made from"
+            f"{path}: {kind} is read through splat-transform ({error}); better still, adapt the"
+            " PLY that it was made from"
         ) from error
 
 
@@ -168,10 +167,7 @@ def read(path: Path, _: bytes) -> Source:
         except ClodError as error:
             raise ClodError(f"{path}: cannot be read ({error}); copy or export it again") from error
         arrays = ply.read(converted, read_bytes(converted)).arrays
-    note = (
-        f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits"
-        " each"
-    )
+    note = "quantised: the file stores positions, scales, rotations and colours in a few bits each"
     return Source(arrays, Metadata(), (note, f"read through splat-transform {tool.version}"))
 
 

@@ -42,15 +42,7 @@ from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ, START, read_bytes
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import DAMAGED, MODEL, TAG, Metadata, Source, document, parse_metadata
-from clod_adapter.io.values import (
-    GROWTH,
-    OPACITY,
-    SIGMA,
-    arrays_of,
-    bytes_of,
-    dial_columns,
-    half_turn,
-)
+from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, bytes_of, dial_columns
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC = 0x5053474E
@@ -62,7 +54,6 @@ RDF = 6  # right, down, forward
 ANTIALIASED = 1  # flag of a filter that compensates opacities
 EXTENDED = 2  # flag of records after the arrays
 MOST_GAUSSIANS = 10_000_000  # Gaussians that the reference reads
-DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
 _STEP = 4  # of the harmonics, which have 6 bits
@@ -75,7 +66,6 @@ QUANTISED = (
 )
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
-_TURNS = {RDF: "", 4: "x", 7: "z"}  # right, up, back; left, up, forward
 _SMALL = 1 << 24  # bytes that any file may
 
 
@@ -98,10 +88,10 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
             f"{path}: has room for {MOST_GAUSSIANS:,} Gaussians within 4,000,000 of 0, {actual};"
             " write a .ply"
         )
-    degree = min(gaussians.sh_degree, DEGREE)
+    degree = gaussians.sh_degree
     flags = EXTENDED | (ANTIALIASED if gaussians.screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
-    sections = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
+    sections = [header, *_packed(arrays, bits), struct.pack("<III", AXES, 4, RDF)]
     metadata = replace(metadata, attenuation=gaussians.attenuation)
     if metadata != Metadata(screen_filter=CLASSIC):
         columns = list(dial_columns(arrays))
@@ -147,10 +137,10 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
     return nearer, bits, (note,)
 
 
-def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes]:
+def _packed(arrays: dict[str, np.ndarray], bits: int) -> list[bytes]:
     # Far beyond what a byte has room for, but not so far that it overflows.
     sh0 = np.clip(arrays["sh0"], -9, 9)
-    harmonics = np.clip(arrays["shN"][:, : SH_COUNTS[degree] - 1], -9, 9)
+    harmonics = np.clip(arrays["shN"], -9, 9)
     steps = np.round(arrays["means"].astype(np.float64) * 2.0**bits)
     fixed = steps.clip(-(2**23), 2**23 - 1).astype("<i4")
     columns = [
@@ -175,7 +165,8 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     packed = largest.astype(np.uint32)
     for axis in range(4):
         component = xyzw[:, axis]
-        level = np.floor(MAGNITUDE * np.abs(component) + 0.5).clip(max=511).astype(np.uint32)
+        level = np.floor(MAGNITUDE * np.abs(component) + 0.5)
+        level = level.clip(max=511).astype(np.uint32)
         sign = np.uint32(512) * (component < 0)
         longer = (packed << 10) | sign | level
         packed = np.where(largest == axis, packed, longer)
@@ -186,7 +177,6 @@ def _losses(arrays: dict[str, np.ndarray], bits: int) -> list[str]:
     notes = [
         f"positions are rounded to {2.0**-bits:.1g}, colours, opacities, scales and rotations to"
         " about 8 bits",
-        *values.dropped_harmonics(arrays, DEGREE),
     ]
     if np.abs(arrays["shN"]).max(initial=0) > 1.01:
         notes.append("harmonics beyond 1 are cut to it")
@@ -205,20 +195,22 @@ def has_dial(path: Path) -> bool:
 
 
 def read(path: Path, data: bytes) -> Source:
-    """Reads versions 2 and 3, SH degree 0 to 4; version 4 is converted by splat-transform."""
+    """Reads version 3, SH degree 0 to 3; versions 2 and 4 are converted by splat-transform."""
     if data.startswith(NEW_SPZ):
         return splat_transform.read(path, data)
+    packed = data
     data = _unpacked(path, data)
-    magic, version, count = struct.unpack_from("<III", data)
-    degree, bits, flags = data[12:15]
-    readable = magic == MAGIC and version in (2, 3)
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
+    if magic == MAGIC and version == 2:
+        return splat_transform.read(path, packed)
+    readable = magic == MAGIC and version == VERSION
     if not readable or degree not in SH_COUNTS or bits > 24 or count > MOST_GAUSSIANS:
         raise ClodError(
-            f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians);"
+            f"{path}: is no SPZ file of version 3 (version {version}, {count} Gaussians);"
             f" {_CONVERT}"
         )
     bands = SH_COUNTS[degree] - 1
-    sizes = 9, 1, 3, 3, 4 if version == 3 else 3, 3 * bands
+    sizes = 9, 1, 3, 3, 4, 3 * bands
     end = HEADER.size + count * sum(sizes)
     if not count or end > len(data):
         raise ClodError(f"{path}: has no Gaussians or is truncated; copy or export it again")
@@ -230,12 +222,11 @@ def read(path: Path, data: bytes) -> Source:
     metadata = parse_metadata(path, stored, dial=bool(dial))
     # the axes; a file without a record has those that converters write
     axes = int.from_bytes(records.get(AXES, bytes([RDF])), "little")
-    if axes not in _TURNS:
+    if axes != RDF:
         raise ClodError(
             f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}"
         )
-    arrays = _unquantized(columns, bits)
-    arrays = (half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays) | dial
+    arrays = _unquantized(columns, bits) | dial
     if dial:  # whose sigma_d is in units of the reference distance where that is large
         tensors: dict[str, Any] = {
             name: torch.from_numpy(array).float()
@@ -297,22 +288,21 @@ def _unquantized(columns: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
     wide = np.zeros((len(means), 3, 4), np.uint8)
     wide[..., 1:] = means.reshape(-1, 3, 3)
     fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
+    levels = harmonics.reshape(len(means), -1, 3).astype(np.float32)
+    # so that logits are finite: the first and last level are a quarter of a level from 0 and 1
+    shares = opacities[:, 0].astype(np.float64).clip(0.25, 254.75) / 255
     return {
         "means": (fixed / 2.0**bits).astype(np.float32),
         "quats": _rotations(quats),
         "log_scales": scales.astype(np.float32) / 16 - 10,
-        "opacity_logits": values.logits_of_bytes(opacities[:, 0]),
+        "opacity_logits": values.logit(shares),
         "sh0": ((colors.astype(np.float32) / 255 - 0.5) / COLOR)[:, None],
-        "shN": (harmonics.reshape(len(means), -1, 3).astype(np.float32) - 128) / 128,
+        "shN": (levels - 128) / 128,
     }
 
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
     """``[N, 4]`` wxyz; the inverse of ``_packed_quats``."""
-    if quats.shape[1] == 3:  # version 2: w is not stored, and at least 0
-        xyz = quats / 127.5 - 1
-        w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True)))
-        return np.concatenate([w, xyz], 1)
     packed = np.ascontiguousarray(quats).view("<u4")[:, 0]
     largest = packed >> 30
     xyzw = np.zeros((len(packed), 4), np.float64)
@@ -322,5 +312,6 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
         xyzw[:, axis] = np.where(stored, np.where(packed & 512, -value, value), 0)
         packed = np.where(stored, packed >> 10, packed)
     squares = (xyzw**2).sum(1)
-    xyzw[np.arange(len(xyzw)), largest] = np.sqrt(np.maximum(0, 1 - squares))
+    rows = np.arange(len(xyzw))
+    xyzw[rows, largest] = np.sqrt(np.maximum(0, 1 - squares))
     return np.roll(xyzw, 1, axis=1).astype(np.float32)

@@ -30,7 +30,7 @@ from clod_adapter._support.arrays import float64_array
 from clod_adapter._support.text import package_version
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import spz
-from clod_adapter.io.formats.glb import DEGREE, EXTENSION, harmonics, write_points
+from clod_adapter.io.formats.glb import EXTENSION, harmonics, write_points
 from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import Origin
 
@@ -104,7 +104,7 @@ def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, .
         f"{EXTENSION}:SCALE": "VEC3",
         f"{EXTENSION}:ROTATION": "VEC4",
     }
-    shapes |= dict.fromkeys(harmonics(min(gaussians.sh_degree, DEGREE))[1:], "VEC3")
+    shapes |= dict.fromkeys(harmonics(gaussians.sh_degree)[1:], "VEC3")
     accessors: dict[str, Any] = {
         name: {"count": len(gaussians), "type": shape} for name, shape in shapes.items()
     }

@@ -12,6 +12,7 @@ from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import make_page
 from clod_adapter.config import FILTERS
+from formats import splat_transform
 from models import write_model
 from runs import names, rebuilt
 from scenes import seeded
@@ -173,10 +174,11 @@ def test_option_overrides_the_file(clod, trained):
 
 
 def test_exports_store_the_filter_or_note_its_loss(clod, trained):
+    splat_transform("--version")
     for out, stores, notes in (
         ("a.ply", True, True),
         ("a.spz", True, False),
-        ("a.splat", False, True),
+        ("a.sog", False, True),
     ):
         done = clod("export", trained[0], "--antialiasing on --json -o", out)
         found = [note for note in done.report["notes"] if "trained antialiased" in note]

@@ -18,7 +18,7 @@ import clod_adapter
 from clod_adapter.cli.shared import inputs, pages
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
-from formats import PACKED
+from formats import PACKED, splat_transform
 from runs import data_in, names, rebuilt
 
 TINY = "--images SCENE --iters 2 --max-sv 4 --out dial.ply"
@@ -45,6 +45,7 @@ def test_values_that_look_activated_need_the_option(clod, capture, tmp_path):
 
 
 def test_a_compressed_file_is_adapted(clod, tmp_path):
+    splat_transform("--version")
     shutil.copy(PACKED, tmp_path / "base.compressed.ply")
     assert "note: base.compressed.ply: quantised" in clod("base.compressed.ply", TINY).err
     assert rebuilt(clod, "base.compressed.ply")

@@ -1,1 +1,0 @@
-"""The nerfstudio method ``clod-splatfacto``; ``method`` is imported by nerfstudio alone."""
