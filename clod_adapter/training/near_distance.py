@@ -20,6 +20,7 @@ from clod_adapter.cameras import View, spread
 from clod_adapter.equation.attenuation import kept_between
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.losses import decibels
 from clod_adapter.progress import Listener, Phase, Stopped, tell
 from clod_adapter.render import render
 
@@ -28,6 +29,8 @@ MEASURED_VIEWS = 6
 STEP = 1.15  # factor between the distances that are tried
 MOST_STEPS = 8
 FARTHEST = 1e3  # end of the search for a dial value
+EXACT = 100.0  # dB, above which pictures are equal
+LOSS = 0.1  # dB that one budget may lose for the others
 PRECISION = 1e-3  # of the dial value that meets a budget
 
 
@@ -37,8 +40,8 @@ def fit_near_distance(
 ) -> Gaussians:
     """The Gaussians with the near_distance whose pictures differ least from those of the views.
 
-    Multiplies it by STEP, or divides, as long as that reduces the mean over BUDGETS of the
-    logarithm of the mean squared error, at equal counts. Budgets beyond ``max_sv`` do not count.
+    Multiplies it by STEP, or divides, as long as that improves the mean of the PSNR over BUDGETS,
+    at equal counts, and no budget has lost more than LOSS. Budgets beyond ``max_sv`` do not count.
     Where ``progress`` returns False, the best one so far is the result.
     """
     assert gaussians.attenuation is not None
@@ -52,32 +55,34 @@ def fit_near_distance(
     budgets = [budget for budget in BUDGETS if budget >= fmean(reached)]
     tried = 0
 
-    def error(candidate: Gaussians) -> float:
+    def quality(candidate: Gaussians) -> list[float]:
         nonlocal tried
         tell(progress, Phase.NEAR_DISTANCE, tried, 2 * MOST_STEPS)
         tried += 1
-        logs = list[float]()
+        found = list[float]()
         for budget in budgets:
-            squares = list[float]()
+            errors = list[float]()
             for view, image, d in zip(views, images, distances, strict=True):
                 s = _dial_for(candidate, d, budget)
                 pixels = render(candidate, view.camera, virtual_scale=s).image.clamp(0, 1)
-                squares.append(float((pixels - image).square().mean()))
-            logs.append(math.log(max(fmean(squares), 1e-10)))
-        return fmean(logs)
+                errors.append(float((pixels - image).square().mean()))
+            found.append(min(decibels(fmean(errors)), EXACT))
+        return found
 
     if not budgets:
         return gaussians
     try:
-        least = error(gaussians)
+        best = highest = quality(gaussians)
         for factor in (STEP, 1 / STEP):
             start = gaussians
             for _ in range(MOST_STEPS):
                 candidate = _with_near_distance(gaussians, factor)
-                found = error(candidate)
-                if found >= least:
+                found = quality(candidate)
+                lost = max(high - psnr for high, psnr in zip(highest, found, strict=True))
+                if fmean(found) <= fmean(best) or lost > LOSS:
                     break
-                gaussians, least = candidate, found
+                gaussians, best = candidate, found
+                highest = [max(pair) for pair in zip(highest, found, strict=True)]
             if gaussians is not start:
                 break
     except Stopped:
