@@ -4,7 +4,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.errors import ClodError
+from clod_adapter import ClodError
 from clod_adapter.io.file_formats import check_readable
 
 from .shared.command import add_activated
@@ -39,9 +39,8 @@ def outputs(args: Namespace) -> Outputs:
 
 
 def execute(args: Namespace) -> dict[str, Any]:
+    from clod_adapter import load_adapter, save
     from clod_adapter.adapter import dial_tensors
-    from clod_adapter.io.adapter_file import load_adapter
-    from clod_adapter.io.checkpoint import save
 
     from .shared.inputs import read_checkpoint
 

@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.errors import ClodError
+from clod_adapter import ClodError
 from clod_adapter.report.charts import check_matplotlib
 
 from . import adapt

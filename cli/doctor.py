@@ -77,7 +77,8 @@ def rendered(device: str, name: str, fix: str) -> Found:
     """Renders sixty Gaussians and compares the image with the reference rasterizer's."""
     import torch
 
-    from clod_adapter.cameras import Camera, intrinsics
+    from clod_adapter import Camera
+    from clod_adapter.cameras import intrinsics
     from clod_adapter.rasterizers import for_device, reference
 
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(7))

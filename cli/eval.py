@@ -14,20 +14,19 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clod_adapter import ClodError, Stopped
 from clod_adapter._support.text import package_version
-from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import file_has_dial
-from clod_adapter.progress import GracefulStop, Listener, Stopped
+from clod_adapter.progress import GracefulStop, Listener
 
 from .shared import command as common
 from .shared.console import Console
 from .shared.outputs import Outputs, labels
 
 if TYPE_CHECKING:
-    from clod_adapter.cameras import Scene
+    from clod_adapter import Gaussians, Scene
     from clod_adapter.evaluation.evaluate import Row
     from clod_adapter.evaluation.popping import Popping
-    from clod_adapter.gaussians import Gaussians
 
 PRUNED = "the unadapted base, pruned to the same counts by two rankings"
 MATCHED = "other files, each row followed by the dial value with the same count"
@@ -240,7 +239,7 @@ class Comparisons:
                 self.report["popping"].append({"moved": moved, **vars(popping)})
 
     def _row(self, gaussians: Gaussians, virtual_scale: float, listener: Listener) -> Row:
-        from clod_adapter.evaluation.evaluate import evaluate
+        from clod_adapter import evaluate
 
         rows = evaluate(
             gaussians, self.scene.test, [virtual_scale], progress=self.stop.stop_on_signal(listener)

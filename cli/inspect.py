@@ -15,8 +15,7 @@ from .shared.console import duration
 from .shared.outputs import size
 
 if TYPE_CHECKING:
-    from clod_adapter.calibration import Calibration
-    from clod_adapter.config import AttenuationConfig
+    from clod_adapter import AttenuationConfig, Calibration
     from clod_adapter.inspection.report import Inspection
     from clod_adapter.inspection.statistics import Splat, Spread
 

@@ -11,9 +11,8 @@ from difflib import get_close_matches
 from importlib import import_module
 from types import ModuleType
 
+from clod_adapter import ClodError, Stopped
 from clod_adapter._support.text import as_text, package_version
-from clod_adapter.errors import ClodError
-from clod_adapter.progress import Stopped
 
 from . import adapt
 from .shared import process

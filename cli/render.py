@@ -8,8 +8,8 @@ from pathlib import Path, PureWindowsPath
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
+from clod_adapter import ClodError
 from clod_adapter._support.text import file_name, package_version
-from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 from clod_adapter.progress import GracefulStop
@@ -21,8 +21,7 @@ from .shared.outputs import Outputs, check_outputs, make_folder
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from clod_adapter.cameras import View
-    from clod_adapter.gaussians import Gaussians
+    from clod_adapter import Gaussians, View
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -131,8 +130,8 @@ def write_images(
     """
     import torch
 
+    from clod_adapter import render
     from clod_adapter.losses import psnr
-    from clod_adapter.render import render
 
     written, stop, plain = list[dict[str, Any]](), GracefulStop(), gaussians.sigma_d is None
     with console.meter("render") as meter, stop.listening():

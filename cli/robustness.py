@@ -12,11 +12,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clod_adapter import AdaptConfig, ClodError, Stopped
 from clod_adapter._support.text import as_text, package_version
-from clod_adapter.config import CLASSIC, AdaptConfig
-from clod_adapter.errors import ClodError
+from clod_adapter.config import CLASSIC
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.progress import GracefulStop, Listener, Stopped
+from clod_adapter.progress import GracefulStop, Listener
 from clod_adapter.report.charts import check_matplotlib
 
 from .shared import command as common
@@ -24,8 +24,7 @@ from .shared.console import Console, ProgressDisplay, duration
 from .shared.outputs import Outputs, labels, write_report
 
 if TYPE_CHECKING:
-    from clod_adapter.cameras import Scene
-    from clod_adapter.io.checkpoint import Checkpoint
+    from clod_adapter import Checkpoint, Scene
 
 
 ADAPTER = ".safetensors"  # suffix
@@ -114,9 +113,9 @@ class Cell:
 
     def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
         """Measures; writes the adapter and then the rows."""
+        from clod_adapter import save_adapter
         from clod_adapter._support.machine import machine
         from clod_adapter.evaluation.robustness import adapt_at_range, baseline
-        from clod_adapter.io.adapter_file import save_adapter
 
         base, adapter_file = self.checkpoint, self.file.with_suffix(ADAPTER)
         if self.config is None:

@@ -14,11 +14,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clod_adapter import ClodError, Stopped
 from clod_adapter._support.text import package_version
-from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS, check_readable
 from clod_adapter.origin import Origin
-from clod_adapter.progress import Stopped
 
 from .shared import command as common
 from .shared.console import Console
@@ -26,7 +25,7 @@ from .shared.outputs import jsonable
 from .shared.process import interrupt_as_stopped
 
 if TYPE_CHECKING:
-    from clod_adapter.io.checkpoint import Checkpoint
+    from clod_adapter import Checkpoint
 
 MODEL, BASE, CONVERTER = "/files/model", "/files/base", "/convert"
 # they would take over the terminal

@@ -3,7 +3,7 @@
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from clod_adapter.errors import ClodError
+from clod_adapter import ClodError
 
 from ..shared.command import add_reading, add_settings, check_inputs, make_config, page_files
 from ..shared.outputs import AdaptFiles, Outputs, check_ply_name

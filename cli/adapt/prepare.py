@@ -16,18 +16,25 @@ from typing import Any
 
 import numpy as np
 
+from clod_adapter import (
+    Checkpoint,
+    Decision,
+    Gaussians,
+    Override,
+    Plan,
+    Scene,
+    Stopped,
+    View,
+    make_plan,
+)
 from clod_adapter._kernels.memory import release
 from clod_adapter.adapter import dial_tensors
-from clod_adapter.cameras import Scene, View
 from clod_adapter.evaluation.calibrate import report_dials
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.robustness import scene_fingerprint
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.progress import GracefulStop, Stopped
+from clod_adapter.progress import GracefulStop
 from clod_adapter.training.loop import time_steps
-from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
-from clod_adapter.training.planner import make_plan
+from clod_adapter.training.plan import NOT_NEEDED
 from clod_adapter.training.pseudo_views import with_pseudo_views
 
 from ..shared import inputs

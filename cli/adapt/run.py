@@ -8,15 +8,14 @@ from contextlib import closing
 from dataclasses import asdict, replace
 from typing import Any
 
+from clod_adapter import Plan, Progress, Result, detach
 from clod_adapter._kernels.memory import release
 from clod_adapter._support.machine import machine
 from clod_adapter._support.text import package_version
-from clod_adapter.adapter import detach
 from clod_adapter.evaluation.calibrate import report_dials
 from clod_adapter.io.atomic import atomic_paths
-from clod_adapter.pipeline import Result, calibrated, extract_result
-from clod_adapter.progress import GracefulStop, Progress
-from clod_adapter.training.plan import Plan
+from clod_adapter.pipeline import calibrated, extract_result
+from clod_adapter.progress import GracefulStop
 from clod_adapter.training.state import Adapted
 
 from ..shared.console import ProgressDisplay, duration

@@ -8,8 +8,8 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+from clod_adapter import ClodError
 from clod_adapter.config import MULTIPLIER
-from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import file_has_dial
 from clod_adapter.io.formats.splat_transform import SplatTransform
 

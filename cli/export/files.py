@@ -10,23 +10,29 @@ from typing import Any
 
 import torch
 
-from clod_adapter.bake import Level, bake, bake_levels, order_by_extinction
+from clod_adapter import (
+    Camera,
+    Checkpoint,
+    ClodError,
+    Gaussians,
+    bake,
+    bake_levels,
+    order_by_extinction,
+    place_cameras,
+    render,
+)
+from clod_adapter.bake import Level
 from clod_adapter.calibration import Viewpoint
-from clod_adapter.cameras import Camera, spread
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.cameras import spread
 from clod_adapter.harmonics import with_sh_degree
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
-from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.file_formats import WRITABLE, write
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.io.settings import Metadata
 from clod_adapter.losses import psnr
 from clod_adapter.origin import Origin
-from clod_adapter.render import render
-from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page
 
 from ..shared import inputs

@@ -12,16 +12,9 @@ from pathlib import Path
 from site import getuserbase
 from typing import Any, NoReturn
 
+from clod_adapter import AdaptConfig, AttenuationConfig, ClodError
 from clod_adapter._support.text import package_version
-from clod_adapter.config import (
-    DEVICES,
-    FILTERS,
-    PLACED_MAX_SV,
-    AdaptConfig,
-    AttenuationConfig,
-    field_descriptions,
-)
-from clod_adapter.errors import ClodError
+from clod_adapter.config import DEVICES, FILTERS, PLACED_MAX_SV, field_descriptions
 from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import QUANTITIES, chart_file, check_matplotlib

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from clod_adapter import Phase, Progress
 from clod_adapter.io.settings import WARNING
-from clod_adapter.progress import GracefulStop, Listener, Phase, Progress
+from clod_adapter.progress import GracefulStop, Listener
 
 if TYPE_CHECKING:
     from tqdm import tqdm

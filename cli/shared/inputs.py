@@ -12,22 +12,32 @@ from typing import Any
 import torch
 from numba.core.event import Event, Listener, install_listener
 
+from clod_adapter import (
+    AdaptConfig,
+    Camera,
+    Checkpoint,
+    ClodError,
+    Gaussians,
+    Phase,
+    Scene,
+    ScreenFilter,
+    Stopped,
+    View,
+    adapt,
+    evaluate,
+    load,
+    load_scene,
+)
 from clod_adapter._support.text import first_line
 from clod_adapter.alignment.align import WORDS, align, compare_frames, detect_filter
 from clod_adapter.alignment.check import MOST_VIEWS
 from clod_adapter.alignment.search import camera_in
-from clod_adapter.cameras import Camera, Scene, View, with_near_planes
-from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, ScreenFilter
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint, load
-from clod_adapter.io.scene.load import load_cameras, load_scene
+from clod_adapter.cameras import with_near_planes
+from clod_adapter.config import CLASSIC, FILTERS
+from clod_adapter.io.scene.load import load_cameras
 from clod_adapter.io.values import Activated, dial_columns
 from clod_adapter.origin import Origin
-from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cuda import unusable
-from clod_adapter.training.loop import adapt
 
 from .console import Console
 from .outputs import size

@@ -6,16 +6,23 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from clod_adapter import (
+    Camera,
+    Checkpoint,
+    ClodError,
+    Gaussians,
+    Phase,
+    Stopped,
+    View,
+    dial_for,
+    evaluate,
+)
 from clod_adapter.calibration import Viewpoint
-from clod_adapter.cameras import Camera, View
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
+from clod_adapter.evaluation.budget import dial_for_times, frame_times
 from clod_adapter.evaluation.calibrate import with_frame_times
-from clod_adapter.evaluation.evaluate import Row, evaluate
+from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.popping import Popping
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.progress import GracefulStop, Phase, Stopped
+from clod_adapter.progress import GracefulStop
 
 from .command import given_budget, no_calibration
 from .console import Console

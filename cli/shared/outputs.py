@@ -15,8 +15,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from clod_adapter import ClodError
 from clod_adapter._support.text import as_text
-from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path, check_target, output_lock, remove_leftovers
 from clod_adapter.io.file_formats import check_suffix, read_source
 from clod_adapter.io.ranks import ranks_of

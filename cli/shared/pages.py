@@ -7,14 +7,19 @@ from typing import Any
 
 import torch
 
-from clod_adapter.cameras import Scene, View
-from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
+from clod_adapter import (
+    AdaptConfig,
+    ClodError,
+    Gaussians,
+    Phase,
+    Progress,
+    Scene,
+    Stopped,
+    View,
+    evaluate,
+    render,
+)
 from clod_adapter.losses import psnr
-from clod_adapter.progress import Phase, Progress, Stopped
-from clod_adapter.render import render
 from clod_adapter.report.page import Picture, from_checkpoint, write_page
 
 from .console import Console
