@@ -6,18 +6,16 @@ from __future__ import annotations
 
 import sys
 from argparse import ArgumentParser, Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
-from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from clod_adapter import ClodError, Stopped
 from clod_adapter._support.text import package_version
 from clod_adapter.io.file_formats import file_has_dial
-from clod_adapter.progress import GracefulStop, Listener
+from clod_adapter.progress import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console
@@ -163,19 +161,19 @@ class Comparisons:
             removal = removal_error(base, views, progress=self.stop.stop_on_signal(meter))
         values = {"opacity": base.opacity_logits, "removal error": removal}
         orders = {by: each.argsort(descending=True, stable=True) for by, each in values.items()}
-        jobs = list(product(rows, orders))
-        with self.console.meter("base") as meter:
-            whole = self._row(base, 1.0, meter.part(0, len(jobs) + 1, "all"))
-            table = self.tables[PRUNED] = [("base", whole)]
-            self.report["base_row"] = whole.as_dict()
-            for i, (ours, by) in enumerate(jobs, 1):
+        whole = self._row(base, 1.0, "base")
+        table = self.tables[PRUNED] = [("base", whole)]
+        self.report["base_row"] = whole.as_dict()
+        for ours in rows:
+            dial = ours.virtual_scale
+            table.append((f"s={dial:g}", ours))
+            for by in orders:
                 pruned = base.select(orders[by][: round(ours.kept)])
-                row = self._row(pruned, 1.0, meter.part(i, len(jobs) + 1, by))
+                row = self._row(pruned, 1.0, f"base by {by}")
                 row = replace(row, kept_share=row.kept / len(base))  # of the whole base
-                model = (f"s={ours.virtual_scale:g}", ours)
-                table += [*([] if model in table else [model]), (by, row)]
+                table.append((by, row))
                 self.report["ranked"].append(
-                    {"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()}
+                    {"virtual_scale": dial, "by": by, "row": row.as_dict()}
                 )
 
     def match(self, others: Mapping[str, Gaussians], rows: Sequence[Row]) -> None:
@@ -184,13 +182,8 @@ class Comparisons:
 
         cameras = [view.camera for view in self.scene.test]
         dials = [row.virtual_scale for row in rows]
-        names = dict(zip(others, labels(list(others)), strict=True))
-        jobs = list[tuple[str, float]]()
-        for path, other in others.items():
-            jobs += [(path, s) for s in (dials if other.sigma_d is not None else [1.0])]
-        with self.console.meter("compare") as meter:
-            for i, (path, s) in enumerate(jobs):
-                other = others[path]
+        for (path, other), label in zip(others.items(), labels(list(others)), strict=True):
+            for s in dials if other.sigma_d is not None else [1.0]:
                 count = mean_kept(other, cameras, s)
                 same = matching_dial(self.model, cameras, count)
                 if abs((kept := mean_kept(self.model, cameras, same)) - count) > CLOSE * count:
@@ -198,15 +191,15 @@ class Comparisons:
                     self.console.note(
                         f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}"
                     )
-                listener = meter.part(i, len(jobs), path)
-                theirs, ours = self._row(other, s, listener), self._row(self.model, same, listener)
+                theirs = self._row(other, s, label)
+                ours = self._row(self.model, same, "model")
                 self.tables.setdefault(MATCHED, []).extend(
-                    [(names[path], theirs), (f"s={ours.virtual_scale:.4g}", ours)]
+                    [(label, theirs), (f"s={same:.4g}", ours)]
                 )
                 self.report["against"].append(
                     {
                         "model": path,
-                        "label": names[path],
+                        "label": label,
                         "theirs": theirs.as_dict(),
                         "ours": ours.as_dict(),
                     }
@@ -221,29 +214,30 @@ class Comparisons:
             )
             return
         test = [view.camera for view in self.scene.test]
-        jobs = list[Any]()
+
+        def sweep(moved: str, popping: Callable[..., Popping], place: Any) -> None:
+            with self.console.meter("popping") as meter:
+                result = popping(
+                    self.model, place, max_sv, progress=self.stop.stop_on_signal(meter)
+                )
+            self.popping.append((moved, result))
+            self.report["popping"].append({"moved": moved, **vars(result)})
+
         for k in range(min(POPPING_VIEWS, len(test))):
             camera = test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)]
-            jobs.append((f"dial, {camera.name}", partial(dial_popping, self.model, camera, max_sv)))
+            sweep(f"dial, {camera.name}", dial_popping, camera)
         cameras = [*test, *(view.camera for view in self.scene.train)]
         ordered = sorted(cameras, key=lambda camera: camera.name)
         # the middle of the capture
         walk = ordered[max((len(ordered) - PATH_CAMERAS) // 2, 0) :][:PATH_CAMERAS]
         if len(walk) > 1:
-            path = partial(path_popping, self.model, walk, max_sv)
-            jobs.append((f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}", path))
-        with self.console.meter("popping") as meter:
-            for i, (moved, sweep) in enumerate(jobs):
-                popping = sweep(progress=self.stop.stop_on_signal(meter.part(i, len(jobs), moved)))
-                self.popping.append((moved, popping))
-                self.report["popping"].append({"moved": moved, **vars(popping)})
+            moved = f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}"
+            sweep(moved, path_popping, walk)
 
-    def _row(self, gaussians: Gaussians, virtual_scale: float, listener: Listener) -> Row:
-        from clod_adapter import evaluate
+    def _row(self, gaussians: Gaussians, virtual_scale: float, label: str) -> Row:
+        from .shared.measure import measure
 
-        rows = evaluate(
-            gaussians, self.scene.test, [virtual_scale], progress=self.stop.stop_on_signal(listener)
-        )
+        rows = measure(gaussians, self.scene.test, [virtual_scale], self.console, self.stop, label)
         if not rows:
             raise Stopped("stopped within a comparison")
         return rows[0]

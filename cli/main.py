@@ -167,7 +167,9 @@ def build_parser(name: str) -> Parser:
     if not name:
         others = "\n".join(f"  {PROG} {word:<10} {summary}" for word, summary in COMMANDS.items())
         parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{adapt.EPILOG}"
-        parser.general.add_argument("--version", action="version")
+        parser.general.add_argument(
+            "--version", action="version", version=f"{PROG} {package_version()}"
+        )
     return parser
 
 

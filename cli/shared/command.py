@@ -13,9 +13,8 @@ from site import getuserbase
 from typing import Any, NoReturn
 
 from clod_adapter import AdaptConfig, AttenuationConfig, ClodError
-from clod_adapter._support.text import package_version
 from clod_adapter.config import DEVICES, FILTERS, PLACED_MAX_SV, field_descriptions
-from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
+from clod_adapter.io.file_formats import check_readable, file_has_dial
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import QUANTITIES, chart_file, check_matplotlib
 
@@ -63,11 +62,6 @@ class Parser(ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise ClodError(f"{message} (see {self.prog} --help)")
 
-    @property
-    def version(self) -> str:
-        """The text of --version."""
-        return f"{self.prog} {package_version()}"
-
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Exits after --help and --version."""
         check_printed()
@@ -108,12 +102,6 @@ If s = 1 meets the budget, or the largest trained dial value loses less than DB,
 that is the result. A count below the trained range is met with a note; a frame
 rate that is out of reach is an error.
 """
-
-
-def no_calibration(model: Path, option: str, why: str = "") -> ClodError:
-    """The error of a budget that needs a calibration."""
-    why = why or "there is no calibration in the header"
-    return ClodError(f"{model}: {option}: {why}; adapt it again, or give --sv or --keep")
 
 
 def add_activated(options: _ActionsContainer) -> None:
@@ -227,15 +215,6 @@ def check_dials(args: Namespace, model: str) -> None:
         raise ClodError(
             f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ..."
         )
-    if name == "psnr_drop" and format_of(Path(model)) is PLY:
-        from clod_adapter.io.ply import read_head  # here: --help needs no plyfile
-        from clod_adapter.io.ply_layout import PREFIX
-
-        if not any(
-            comment.startswith(f"{PREFIX}calibrated ")
-            for comment in read_head(Path(model)).comments
-        ):
-            raise no_calibration(Path(model), option)
 
 
 def check_inputs(scene: str | None, *paths: str) -> None:

@@ -24,7 +24,7 @@ from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.popping import Popping
 from clod_adapter.progress import GracefulStop
 
-from .command import given_budget, no_calibration
+from .command import given_budget
 from .console import Console
 from .inputs import prepare_kernels
 
@@ -175,8 +175,9 @@ def solve_dials(
             *notes,
         )
     elif name != "keep" and calibration is None:
-        why = next((note for note in model.notes if "calibration" in note), "")
-        raise no_calibration(model.path, option, why)
+        none = "there is no calibration in the header"
+        why = next((note for note in model.notes if "calibration" in note), none)
+        raise ClodError(f"{model.path}: {option}: {why}; adapt it again, or give --sv or --keep")
     elif name == "fps" and calibration is not None:
         machine = (
             f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
