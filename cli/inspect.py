@@ -85,17 +85,13 @@ def splat_lines(splat: Splat) -> list[str]:
         more = f", not read: {names}" if splat.extra else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
     lines += _block("says", [comment[:LONGEST] for comment in splat.comments])
-    rows = [
+    rows: list[tuple[str, Spread | None]] = [
         *zip("xyz", splat.position, strict=True),
         ("scale", splat.scale),
         ("opacity", splat.opacity),
     ]
-    rows += [
-        (name, each)
-        for name, each in (("sigma_d", splat.sigma), ("growth_d", splat.growth))
-        if each is not None
-    ]
-    lines += ["", *spread_table(rows), ""]
+    rows += [("sigma_d", splat.sigma), ("growth_d", splat.growth)]
+    lines += spread_table(rows)
     shares = f"{splat.fainter_than_visible:.1%} fainter than 1/255; {splat.needles:.1%} needles"
     lines.append(_line("shares", shares))
     if splat.dial is None:
@@ -104,10 +100,12 @@ def splat_lines(splat: Splat) -> list[str]:
     return lines + calibration_lines(splat.dial.calibration)
 
 
-def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
-    lines = [_line("", ("{:>11}" * 5).format("least", "1 %", "median", "99 %", "greatest"))]
+def spread_table(rows: Sequence[tuple[str, Spread | None]]) -> list[str]:
+    """A table of those that there are, between empty lines."""
+    lines = ["", _line("", ("{:>11}" * 5).format("least", "1 %", "median", "99 %", "greatest"))]
     numbers = "{:>11.4g}" * 5
-    return lines + [_line(name, numbers.format(*astuple(spread))) for name, spread in rows]
+    lines += [_line(name, numbers.format(*astuple(spread))) for name, spread in rows if spread]
+    return [*lines, ""]
 
 
 def calibration_lines(calibration: Calibration | None) -> list[str]:
@@ -148,13 +146,9 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
         f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS
     )
     lines.append(_line("trained with", settings or "unknown settings"))
-    columns = {
-        name: about[key]
-        for name, key in (("sigma_d", "sigma"), ("growth_d", "growth"))
-        if about[key]
-    }
-    lines += ["", *spread_table([*columns.items()]), ""]
-    lines.append(_line("dial", f"{' and '.join(columns)}, {_settings(about['attenuation'])}"))
+    lines += spread_table([("sigma_d", about["sigma"]), ("growth_d", about["growth"])])
+    columns = "sigma_d and growth_d" if about["growth"] else "sigma_d"
+    lines.append(_line("dial", f"{columns}, {_settings(about['attenuation'])}"))
     return lines + calibration_lines(about["calibration"])
 
 

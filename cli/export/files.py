@@ -8,11 +8,8 @@ from statistics import fmean
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import torch
-
 from clod_adapter import (
     Camera,
-    Checkpoint,
     ClodError,
     Gaussians,
     bake,
@@ -32,7 +29,6 @@ from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.io.settings import Metadata
 from clod_adapter.losses import psnr
-from clod_adapter.origin import Origin
 from clod_adapter.viewer.page import write_viewer_page
 
 from ..shared import inputs
@@ -116,8 +112,11 @@ class Export:
         self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
         times = args.images is not None and args.fps
         device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
-        self.model = self._read(args.model, device)
-        self.others = [self._read(path, device, self.model.origin) for path in args.others]
+        self.model = inputs.read_model(args, args.model, self.console, device=device)
+        self.others = [
+            inputs.read_model(args, path, self.console, self.model.origin, device)
+            for path in args.others
+        ]
         # to bake or fit for, none where nothing is; in printable ASCII
         self.cameras, self.about = self._find_cameras()
         reads = self.page and args.images is not None  # cameras of the scene, for a page
@@ -138,11 +137,6 @@ class Export:
         elif dials:
             dials = choose_dials(dials, self.model, self.console)
         self.dials: list[float] = dials or []  # which are baked, or the one at which a page opens
-
-    def _read(self, path: str, device: torch.device, origin: Origin | None = None) -> Checkpoint:
-        activated = self.args.activated
-        read = inputs.read_checkpoint(path, self.console, activated, origin, device)
-        return inputs.with_filter(read, self.args, self.console)
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they
@@ -238,13 +232,13 @@ class Export:
                 folder.mkdir()
                 found = self._write_set(folder / FOLDERS[option])
                 taken = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-            levels = [{"begins": level.begins, "count": len(level.gaussians)} for level in found]
-            counts = [level["count"] for level in levels]
             return [
                 {
                     "file": str(out / FOLDERS[option]),
-                    "levels": levels,
-                    "count": sum(counts),
+                    "levels": [
+                        {"begins": level.begins, "count": len(level.gaussians)} for level in found
+                    ],
+                    "count": sum(len(level.gaussians) for level in found),
                     "bytes": taken,
                 }
             ]
@@ -323,13 +317,14 @@ class Export:
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Notes the PSNR of its renders against those of the exact Gaussians."""
         inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
-        how: dict[str, Any] = {
-            "others": self.others,
-            "cameras": self.views,
-            "virtual_scale": virtual_scale,
-            "exact": self.args.exact,
-        }
-        shown, losses = write_viewer_page(path, self.model, **how)
+        shown, losses = write_viewer_page(
+            path,
+            self.model,
+            others=self.others,
+            cameras=self.views,
+            virtual_scale=virtual_scale,
+            exact=self.args.exact,
+        )
         self.console.note(*losses)
         if self.args.exact:
             return

@@ -66,6 +66,19 @@ def read_checkpoint(
     return replace(checkpoint, gaussians=gaussians.to(device))
 
 
+def read_model(
+    args: argparse.Namespace,
+    path: str,
+    console: Console,
+    origin: Origin | None = None,
+    device: torch.device = CPU,
+) -> Checkpoint:
+    """The checkpoint as the options for reading say, without photographs to compare with."""
+    return with_filter(
+        read_checkpoint(path, console, args.activated, origin, device), args, console
+    )
+
+
 def read_scene(folder: str, console: Console, origin: Origin) -> Scene:
     with console.meter(Phase.PHOTOGRAPHS) as meter:
         scene = load_scene(folder, origin=origin, progress=meter)
