@@ -2,14 +2,13 @@
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
 
 from clod_adapter import ClodError
 from clod_adapter.io.file_formats import check_readable
 
 from .shared.command import add_activated
 from .shared.console import Console
-from .shared.outputs import Outputs, check_ply_name, size
+from .shared.outputs import Outputs, Report, check_ply_name, size
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -38,7 +37,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs([Path(args.out)], inputs=[args.base, args.adapter])
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter import load_adapter, save
     from clod_adapter.adapter import dial_tensors
 

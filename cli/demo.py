@@ -4,7 +4,6 @@ result.
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
 
 from clod_adapter import ClodError
 from clod_adapter.report.charts import check_matplotlib
@@ -12,7 +11,7 @@ from clod_adapter.report.charts import check_matplotlib
 from . import adapt
 from .shared.command import parser_of
 from .shared.console import Console, duration
-from .shared.outputs import AdaptFiles, Outputs, claimed
+from .shared.outputs import AdaptFiles, Outputs, Report, claimed
 
 MAX_SV = 5.0
 PICTURES = {"dial": "dial.png", "curve": "curve.png"}
@@ -36,7 +35,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs(derived=[*vars(model).values(), *pictures], folders=[folder])
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter.demo import draw, unpack
 
     from .shared.inputs import prepare_kernels

@@ -11,6 +11,7 @@ from typing import Any
 from clod_adapter._support.text import first_line
 
 from .shared.console import Console
+from .shared.outputs import Report
 from .view import find_browser
 
 TORCH = "pip install --force-reinstall torch (https://pytorch.org has the command for a GPU)"
@@ -101,9 +102,9 @@ def rendered(device: str, name: str, fix: str) -> Found:
     return True, f"{name}renders the reference image (RMS {error:.0e})", ""
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     """Runs all checks; the report's exit code is 1 where nothing renders."""
-    findings = list[dict[str, Any]]()
+    findings = list[Report]()
     with Console(args.quiet).status("checking ..."), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's
         for name, check in CHECKS.items():

@@ -19,7 +19,7 @@ from clod_adapter.progress import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console
-from .shared.outputs import Outputs, labels
+from .shared.outputs import Outputs, Report, labels
 
 if TYPE_CHECKING:
     from clod_adapter import Gaussians, Scene
@@ -80,7 +80,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs([page], charts, inputs=paths(args), scene=args.images)
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter._support.machine import machine
 
     from .shared import measure as measuring
@@ -108,7 +108,7 @@ def execute(args: Namespace) -> dict[str, Any]:
             if args.popping:
                 comparisons.pop(max(row.virtual_scale for row in rows))
     print(comparisons.text(), end="")
-    report: dict[str, Any] = {  # the page has the first two as well
+    report: Report = {  # the page has the first two as well
         "command": "eval",
         "version": package_version(),
         "model": args.model,
@@ -145,7 +145,7 @@ class Comparisons:
         self.scene = scene
         self.console = console
         self.stop = stop
-        self.report: dict[str, Any] = {"base_row": None, "ranked": [], "against": [], "popping": []}
+        self.report: Report = {"base_row": None, "ranked": [], "against": [], "popping": []}
         self.tables: dict[str, list[tuple[str, Row]]] = {}
         self.popping: list[tuple[str, Popping]] = []
 

@@ -6,13 +6,13 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.settings import WARNING
 
 from .shared.console import duration
-from .shared.outputs import size
+from .shared.outputs import Report, size
 
 if TYPE_CHECKING:
     from clod_adapter import AttenuationConfig, Calibration
@@ -40,7 +40,7 @@ def check(args: Namespace) -> None:
         check_readable(path)
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter.inspection.report import inspect
 
     found = inspect(args.file)
@@ -126,7 +126,7 @@ def calibration_lines(calibration: Calibration | None) -> list[str]:
     return lines + [_line("", numbers.format(*astuple(row))) for row in rows]
 
 
-def tensor_lines(about: dict[str, Any]) -> list[str]:
+def tensor_lines(about: Report) -> list[str]:
     lines = [_line("Gaussians", f"{about['count']:,}")]
     if about["kind"] == "state":
         after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"

@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from clod_adapter import ClodError
 from clod_adapter._support.text import file_name, package_version
@@ -16,7 +16,7 @@ from clod_adapter.progress import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console
-from .shared.outputs import Outputs, check_outputs, make_folder
+from .shared.outputs import Outputs, Report, check_outputs, make_folder
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -66,7 +66,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs(folders=[Path(args.out)], inputs=[args.model], scene=args.images)
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from .shared.inputs import pick_views, read_inputs
     from .shared.measure import Stopwatch, choose_dials, solve_dials
 
@@ -121,7 +121,7 @@ def write_images(
     dials: Sequence[float],
     beside: bool,
     console: Console,
-) -> list[dict[str, Any]]:
+) -> list[Report]:
     """Writes a file per view, until Ctrl-C: the dial values from left to right, after the
     photograph if asked for.
 
@@ -133,7 +133,7 @@ def write_images(
     from clod_adapter import render
     from clod_adapter.losses import psnr
 
-    written, stop, plain = list[dict[str, Any]](), GracefulStop(), gaussians.sigma_d is None
+    written, stop, plain = list[Report](), GracefulStop(), gaussians.sigma_d is None
     with console.meter("render") as meter, stop.listening():
         for file, view in views:
             with torch.no_grad():

@@ -10,7 +10,7 @@ from argparse import ArgumentParser, Namespace
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from clod_adapter import AdaptConfig, ClodError, Stopped
 from clod_adapter._support.text import as_text, package_version
@@ -21,7 +21,7 @@ from clod_adapter.report.charts import check_matplotlib
 
 from .shared import command as common
 from .shared.console import Console, ProgressDisplay, duration
-from .shared.outputs import Outputs, labels, write_report
+from .shared.outputs import Outputs, Report, labels, write_report
 
 if TYPE_CHECKING:
     from clod_adapter import Checkpoint, Scene
@@ -89,7 +89,7 @@ class Cell:
     file: Path
 
     @property
-    def key(self) -> dict[str, Any]:
+    def key(self) -> Report:
         """Everything that the result depends on, as JSON."""
         drawn = self.checkpoint.gaussians.screen_filter
         return {
@@ -101,7 +101,7 @@ class Cell:
             **({"screen_filter": repr(drawn)} if drawn != CLASSIC else {}),
         }
 
-    def read(self) -> dict[str, Any] | None:
+    def read(self) -> Report | None:
         """The finished cell, or None if there is none with this key."""
         try:
             cell = json.loads(self.file.read_text(encoding="utf-8"))
@@ -111,7 +111,7 @@ class Cell:
         complete = self.config is None or self.file.with_suffix(ADAPTER).is_file()
         return cell if same and complete else None
 
-    def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
+    def run(self, scene: Scene, progress: Listener) -> Report:
         """Measures; writes the adapter and then the rows."""
         from clod_adapter import save_adapter
         from clod_adapter._support.machine import machine
@@ -139,7 +139,7 @@ class Cell:
         return cell
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter._support.machine import machine
     from clod_adapter.evaluation.calibrate import report_dials
     from clod_adapter.evaluation.robustness import BASELINE_SHARES, scene_fingerprint
@@ -216,7 +216,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     return report
 
 
-def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) -> None:
+def write_results(report: Report, files: dict[str, Path], scene: str) -> None:
     from clod_adapter.report.robustness_figure import robustness_figure
 
     title = (
@@ -239,7 +239,7 @@ def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) ->
     write_report(files["json"], report)
 
 
-def print_cells(report: dict[str, Any]) -> None:
+def print_cells(report: Report) -> None:
     """One line per cell: its first and last row."""
     names = [cell["checkpoint"] for cell in report["cells"]]
     width = max(map(len, ["checkpoint", *names]))

@@ -20,7 +20,7 @@ from clod_adapter.io.file_formats import FORMATS, check_readable
 
 from .shared import command as common
 from .shared.console import Console
-from .shared.outputs import jsonable
+from .shared.outputs import Report, jsonable
 from .shared.process import interrupt_as_stopped
 
 MODEL, BASE, CONVERTER = "/files/model", "/files/base", "/convert"
@@ -115,7 +115,7 @@ def execute(args: Namespace) -> None:
         console.say("ended")
 
 
-def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[str, Any]]:
+def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], Report]:
     """What the server answers by path, and the report."""
     from clod_adapter.viewer.page import (
         Payload,

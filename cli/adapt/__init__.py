@@ -6,7 +6,7 @@ from typing import Any
 from clod_adapter import ClodError
 
 from ..shared.command import add_reading, add_settings, check_inputs, make_config, page_files
-from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
+from ..shared.outputs import AdaptFiles, Outputs, Report, check_ply_name
 
 # As in clod_adapter.training.plan, which imports torch; a test compares the two.
 NAMES = ("bands", "means", "quats", "scales", "opacities", "sh0")
@@ -68,7 +68,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs(named, derived, inputs=[args.ply], scene=args.images)
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from .run import adapt
 
     return adapt(args)

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -39,9 +38,9 @@ from clod_adapter.training.pseudo_views import with_pseudo_views
 
 from ..shared import inputs
 from ..shared.command import make_config
-from ..shared.console import Console, ProgressDisplay
+from ..shared.console import Console, ProgressDisplay, duration
 from ..shared.measure import Stopwatch, measure
-from ..shared.outputs import AdaptFiles
+from ..shared.outputs import AdaptFiles, Report, size
 from ..shared.pages import SNAPSHOT_VIEWS
 from ..shared.process import launched
 from .listeners import Saver
@@ -61,11 +60,11 @@ class Run:
     base: Checkpoint
     scene: Scene
     # the measurements of the check; None without photographs
-    alignment: dict[str, Any] | None = None
+    alignment: Report | None = None
     base_rows: list[Row]  # at dial value 1; none if nothing is held out
     base_seconds = 0.0  # of measuring it
     cut = True  # whether the measurements of the result are missing or incomplete
-    forecast: dict[str, Any] | None = None
+    forecast: Report | None = None
     forecast_at = 0.0
 
     def __init__(self, args: argparse.Namespace) -> None:
@@ -190,14 +189,13 @@ def forecast(run: Run, plan: Plan) -> None:
         )
         peak += 7 * _bytes(plan.start.without_bands(0))
     seconds = training + measuring + _bytes(base.gaussians) / WRITING
-    minutes = f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
-    memory = f", {in_words(peak)}" if peak else ""
-    run.console.say(f"forecast: {minutes}{memory} ({steps:,} steps)")
+    memory = f", {size(peak)}" if peak else ""
+    run.console.say(f"forecast: {duration(seconds)}{memory} ({steps:,} steps)")
     run.forecast_at = time.perf_counter()
     run.forecast = {"seconds": round(seconds, 1), "bytes": peak, "steps": steps}
 
 
-def against_forecast(run: Run) -> dict[str, Any] | None:
+def against_forecast(run: Run) -> Report | None:
     """The forecast, and what the run has taken since."""
     taken = {
         "actual_seconds": round(time.perf_counter() - run.forecast_at, 1),
@@ -229,11 +227,6 @@ def show_plan(decisions: Sequence[Decision], console: Console) -> None:
         console.say(f"  {what:<{a}}  {verdict:<{b}}  {effect:>{c}}  {option}".rstrip())
     if others := [each.what for each in decisions if each.verdict == NOT_NEEDED]:
         console.say(f"  does not apply: {', '.join(others)}")
-
-
-def in_words(count: float) -> str:
-    """``3.14 GB``, ``500 MB``, ``1234.5 GB``."""
-    return f"{round(count / 1e9, 2):g} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 def _bytes(gaussians: Gaussians) -> int:

@@ -6,7 +6,6 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from itertools import pairwise
 from math import inf
 from pathlib import Path
-from typing import Any
 
 from clod_adapter import ClodError
 from clod_adapter.config import MULTIPLIER
@@ -14,7 +13,7 @@ from clod_adapter.io.file_formats import file_has_dial
 from clod_adapter.io.formats.splat_transform import SplatTransform
 
 from ..shared import command as common
-from ..shared.outputs import Outputs
+from ..shared.outputs import Outputs, Report
 from .names import FOLDERS, FORMATS, PACKED, PAGE, is_page, level_paths, suffix_of
 
 DIGITS = 6  # significant digits of a level, all of them in its file's name
@@ -192,7 +191,7 @@ def outputs(args: Namespace) -> Outputs:
     )
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from .files import export
 
     return export(args)

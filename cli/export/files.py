@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from clod_adapter import (
     Camera,
@@ -35,7 +34,7 @@ from ..shared import inputs
 from ..shared.command import given_budget, initial_dial
 from ..shared.console import Console, duration
 from ..shared.measure import Stopwatch, choose_dials, solve_dials
-from ..shared.outputs import size
+from ..shared.outputs import Report, size
 from .names import FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 
 PLACED = 16  # cameras placed where none are known
@@ -53,7 +52,7 @@ SETTINGS = {
 COMPARED = 4  # views on which a page is compared with the exact values
 
 
-def export(args: Namespace) -> dict[str, Any]:
+def export(args: Namespace) -> Report:
     """Reads, bakes and writes; prints what was written, and returns the report."""
     watch, export = Stopwatch(), Export(args)
     export.note_losses()
@@ -87,7 +86,7 @@ def export(args: Namespace) -> dict[str, Any]:
     }
 
 
-def line_of(output: dict[str, Any], total: int) -> str:
+def line_of(output: Report, total: int) -> str:
     """Describes an output of a model of ``total`` Gaussians in a line."""
     line = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,}"
     if levels := output.get("levels"):
@@ -224,9 +223,9 @@ class Export:
                 ' for it: antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
             )
 
-    def write(self) -> list[dict[str, Any]]:
+    def write(self) -> list[Report]:
         """Writes all files of the command, all or none; a description of each."""
-        out, written = Path(self.args.out), list[dict[str, Any]]()
+        out, written = Path(self.args.out), list[Report]()
         if option := self.args.folder:
             with atomic_path(out) as folder:
                 folder.mkdir()

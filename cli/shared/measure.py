@@ -190,14 +190,13 @@ def solve_dials(
     dials = []
     for value in values:
         asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
-        wanted: dict[str, Any] = {
-            name: value,
-            "cameras": cameras,
-            "calibration": calibration,
-            "baked": baked,
-        }
+        wanted: dict[str, Any] = {name: value, "cameras": cameras, "baked": baked}
         try:
-            solved = dial_for_times(times, value) if times else dial_for(model.gaussians, **wanted)
+            solved = (
+                dial_for_times(times, value)
+                if times
+                else dial_for(model.gaussians, calibration=calibration, **wanted)
+            )
         except ClodError as error:
             raise ClodError(f"{asked}: {error}{machine}") from error
         dials.append(solved.virtual_scale)
