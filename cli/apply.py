@@ -6,22 +6,18 @@ from pathlib import Path
 from clod_adapter import ClodError
 from clod_adapter.io.file_formats import check_readable
 
-from .shared.command import add_activated
+from .shared.command import add_activated, add_input, add_out
 from .shared.console import Console
 from .shared.outputs import Outputs, Report, check_ply_name, size
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
+    given = add_input(parser, "base", "BASE.ply", "the checkpoint that was adapted")
     given.add_argument(
         "adapter", metavar="ADAPTER.safetensors", help="the adapter that clod-adapt wrote"
     )
     add_activated(given)
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="OUT.ply", required=True, help="output file; replaced if it exists"
-    )
+    add_out(parser, "OUT.ply", "output file; replaced if it exists", required=True)
 
 
 def check(args: Namespace) -> None:

@@ -9,7 +9,7 @@ from clod_adapter import ClodError
 from clod_adapter.report.charts import check_matplotlib
 
 from . import adapt
-from .shared.command import parser_of
+from .shared.command import add_out, parser_of
 from .shared.console import Console, duration
 from .shared.outputs import AdaptFiles, Outputs, Report, claimed
 
@@ -18,10 +18,7 @@ PICTURES = {"dial": "dial.png", "curve": "curve.png"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="DIR", default="demo", help="output folder (default: demo)"
-    )
+    add_out(parser, "DIR", "output folder (default: demo)", "demo")
 
 
 def check(args: Namespace) -> None:

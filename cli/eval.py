@@ -34,10 +34,8 @@ PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument(
-        "model", metavar="MODEL.ply", help="an adapted file, or a plain one as a baseline"
-    )
+    text = "an adapted file, or a plain one as a baseline"
+    given = common.add_input(parser, "model", "MODEL.ply", text)
     common.add_reading(given)
     dial = parser.add_argument_group("dial values, one of")
     default = (

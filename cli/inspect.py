@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.settings import WARNING
 
+from .shared.command import add_input
 from .shared.console import duration
 from .shared.outputs import Report, size
 
@@ -27,10 +28,8 @@ SETTINGS = ("max_sv", "iters", "seed", "form")  # of the training settings, thos
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument(
-        "file", metavar="FILE", help="a splat, an adapter, or the state of an interrupted run"
-    )
+    text = "a splat, an adapter, or the state of an interrupted run"
+    add_input(parser, "file", "FILE", text)
     parser.set_defaults(quiet=True)
 
 

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
+    given = common.add_input(parser, "model", "MODEL.ply", "an adapted file, or a plain one")
     common.add_reading(given)
     text = "photographs whose cameras to render: names, all, or held-out (default)"
     given.add_argument("--views", metavar="NAME", nargs="+", default=["held-out"], help=text)
@@ -34,10 +33,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     common.add_dial_options(
         dial, "dial values (default: 1)", "(mean over the images)", several=True
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="FOLDER", required=True, help="output folder; made if missing"
-    )
+    output = common.add_out(parser, "FOLDER", "output folder; made if missing", required=True)
     output.add_argument(
         "--beside", action="store_true", help="put the photograph left of the renders"
     )

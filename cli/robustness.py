@@ -36,9 +36,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "ply", metavar="PLY", nargs="+", help="checkpoints of one scene; never modified"
     )
     common.add_reading(given)
-    output = parser.add_argument_group("output")
     text = "output folder; resumed if it exists (default: robustness)"
-    output.add_argument("-o", "--out", metavar="DIR", default="robustness", help=text)
+    common.add_out(parser, "DIR", text, "robustness")
     training = parser.add_argument_group("training")
     text = "largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)"
     training.add_argument(

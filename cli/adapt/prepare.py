@@ -102,17 +102,13 @@ class Run:
         if base.gaussians.screen_filter.compensate:
             with watch.time("kernels"):
                 inputs.prepare_kernels(console, device, screen_filter=base.gaussians.screen_filter)
-        with watch.time("place" if photographs is None else "evaluate"):
-            self.place(photographs)
+        with (
+            watch.time("place" if photographs is None else "evaluate"),
+            closing(ProgressDisplay(console, self.stop)) as display,
+        ):
+            self.scene = with_pseudo_views(base.gaussians, photographs, self.config.seed, display)
+        console.note(*self.scene.notes)
         self.config = self.config.for_views(len(self.scene.train))
-
-    def place(self, photographs: Scene | None) -> None:
-        """Adds pseudo views where photographs are few, and replaces them where there are none."""
-        with closing(ProgressDisplay(self.console, self.stop)) as display:
-            self.scene = with_pseudo_views(
-                self.base.gaussians, photographs, self.config.seed, display
-            )
-        self.console.note(*self.scene.notes)
 
     def identify(self) -> None:
         """Refuses the state of another run."""
@@ -215,16 +211,14 @@ def peak_bytes() -> int:
 
 
 def show_plan(decisions: Sequence[Decision], console: Console) -> None:
-    rows = [(d.what, d.verdict, d.measured, d.name) for d in decisions if d.verdict != NOT_NEEDED]
-    a, b, c = (
-        (max(map(len, column)) for column in list(zip(*rows, strict=True))[:3])
-        if rows
-        else (0, 0, 0)
-    )
+    needed = [each for each in decisions if each.verdict != NOT_NEEDED]
+    width = max((len(each.what) for each in needed), default=0)
     console.say("plan: action, measured effect, option that overrides it; reasons in the report")
-    for what, verdict, effect, name in rows:
+    for each in needed:
+        what, verdict, name = each.what, each.verdict, each.name
         option = f"{'--without' if verdict == 'kept' else '--with'} {name}" if name else ""
-        console.say(f"  {what:<{a}}  {verdict:<{b}}  {effect:>{c}}  {option}".rstrip())
+        line = f"  {what:<{width}}  {verdict:<10}  {each.measured:>14}  {option}"
+        console.say(line.rstrip())
     if others := [each.what for each in decisions if each.verdict == NOT_NEEDED]:
         console.say(f"  does not apply: {', '.join(others)}")
 

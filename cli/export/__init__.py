@@ -33,8 +33,8 @@ def levels_of(text: str) -> list[float]:
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
+    text = "an adapted file, or a plain one to convert"
+    given = common.add_input(parser, "model", "MODEL", text)
     given.add_argument(
         "others", metavar="OTHER", nargs="*", help=f"more of them, to switch to in an {PAGE} page"
     )
@@ -50,10 +50,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     values.add_argument(
         "--levels", metavar="S,S,...", type=levels_of, help="dial values, each baked into a file"
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="OUT", required=True, help="output file; its suffix is the format"
-    )
+    text = "output file; its suffix is the format"
+    output = common.add_out(parser, "OUT", text, required=True)
     sets = output.add_mutually_exclusive_group()
     for option, form in (
         ("--lod-meta", "streaming set for PlayCanvas's viewers"),

@@ -104,6 +104,22 @@ rate that is out of reach is an error.
 """
 
 
+def add_input(parser: ArgumentParser, name: str, metavar: str, text: str) -> _ActionsContainer:
+    """Adds the group of what is read, with the file that every command has; returns it."""
+    given = parser.add_argument_group("input")
+    given.add_argument(name, metavar=metavar, help=text)
+    return given
+
+
+def add_out(
+    parser: ArgumentParser, metavar: str, text: str, default: str | None = None, **more: Any
+) -> _ActionsContainer:
+    """Adds the group of what is written, with ``--out``; returns it."""
+    output = parser.add_argument_group("output")
+    output.add_argument("-o", "--out", metavar=metavar, default=default, help=text, **more)
+    return output
+
+
 def add_activated(options: _ActionsContainer) -> None:
     text = "values that the file stores after activation (sigmoid of opacities, exp of scales)"
     options.add_argument("--activated", choices=["none", "opacity", "scales", "both"], help=text)
