@@ -63,11 +63,7 @@ def execute(args: Namespace) -> Report:
         pictures, drawn = {}, "no figures: the measurements were interrupted"
     print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}\n{drawn}")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
-    return report | {
-        "command": "demo",
-        "folder": str(folder),
-        "pictures": {k: str(v) for k, v in pictures.items()},
-    }
+    return report | {"command": "demo", "folder": folder, "pictures": pictures}
 
 
 DESCRIPTION = """\

@@ -8,7 +8,7 @@ import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,7 +91,8 @@ def execute(args: Namespace) -> Report:
     base = others.pop() if args.base else None
     given = measuring.solve_dials(args, models[0], [view.camera for view in scene.test], console)
     dials = measuring.choose_dials(given, models[0], console)
-    comparisons = Comparisons(model, scene, console, stop)
+    compared: Report = {"base_row": None, "ranked": [], "against": [], "popping": []}
+    comparisons = Comparisons(model, scene, console, stop, compared)
     with stop.listening():
         rows = measuring.measure(model, scene.test, dials, console, stop)
         if not rows:
@@ -116,7 +117,7 @@ def execute(args: Namespace) -> Report:
         "views": len(scene.test),
         "rows": [row.as_dict() for row in rows],
         "base": args.base,
-        **comparisons.report,
+        **compared,
         "interrupted": stop.requests > 0,
         "attenuation": asdict(model.attenuation) if model.attenuation else None,
         "notes": console.notes,
@@ -133,19 +134,17 @@ def execute(args: Namespace) -> Report:
     return report
 
 
+@dataclass
 class Comparisons:
     """Comparisons of a model; those that are finished, in ``report`` for --json and as text."""
 
-    def __init__(
-        self, model: Gaussians, scene: Scene, console: Console, stop: GracefulStop
-    ) -> None:
-        self.model = model
-        self.scene = scene
-        self.console = console
-        self.stop = stop
-        self.report: Report = {"base_row": None, "ranked": [], "against": [], "popping": []}
-        self.tables: dict[str, list[tuple[str, Row]]] = {}
-        self.popping: list[tuple[str, Popping]] = []
+    model: Gaussians
+    scene: Scene
+    console: Console
+    stop: GracefulStop
+    report: Report
+    tables: dict[str, list[tuple[str, Row]]] = field(default_factory=dict)
+    popping: list[tuple[str, Popping]] = field(default_factory=list)
 
     def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
         """Measures the base with all its Gaussians, and pruned by two rankings to the counts of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from statistics import fmean
 from typing import TYPE_CHECKING
@@ -70,7 +71,7 @@ def execute(args: Namespace) -> Report:
     (model,), scene = read_inputs(args, [args.model], console, held_out=False)
     views = pick_views(scene, args.views)
     images = [out / name for name in image_names(views)]
-    check_outputs(Outputs(derived=images, folders=[out], inputs=[args.model], scene=args.images))
+    check_outputs(replace(outputs(args), derived=images))
     solved = solve_dials(args, model, [view.camera for view in views], console)
     dials = choose_dials(solved or [1.0], model, console)
     gaussians = model.gaussians.without_empty_bands()
@@ -138,9 +139,7 @@ def write_images(
             write_png(file, torch.cat([view.image, *panels] if beside else panels, dim=1))
             kept = [int(rendering.kept.sum()) for rendering in shown]
             errors = [psnr(rendering.image, view.image) for rendering in shown]
-            written.append(
-                {"view": view.camera.name, "file": str(file), "kept": kept, "psnr": errors}
-            )
+            written.append({"view": view.camera.name, "file": file, "kept": kept, "psnr": errors})
             meter.update(len(written) / len(views), f"{len(written)}/{len(views)}")
             if stop.requests:
                 break

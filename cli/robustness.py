@@ -128,7 +128,7 @@ class Cell:
             "checkpoint": as_text(self.label),
             "max_sv": self.config and self.config.max_sv,
             "rows": result.rows,
-            "adapter": str(adapter_file) if result.adapter else None,
+            "adapter": adapter_file if result.adapter else None,
             "seconds": round(result.seconds, 3),
             "distribution": result.distribution,
             "machine": machine(),
@@ -186,7 +186,8 @@ def execute(args: Namespace) -> Report:
                 break
         if not found:
             raise Stopped("stopped before the first cell was finished")
-        files, missing = result_files(Path(args.out)), [name for name in cells if name not in found]
+        files = result_files(Path(args.out))
+        missing = [name for name in cells if name not in found]
         report = {
             "command": "robustness",
             "version": package_version(),
@@ -194,7 +195,7 @@ def execute(args: Namespace) -> Report:
             "checkpoints": [
                 {
                     "checkpoint": label,
-                    "model": str(each.path),
+                    "model": each.path,
                     "count": len(each.gaussians),
                     "sha256": each.fingerprint,
                 }
@@ -207,7 +208,7 @@ def execute(args: Namespace) -> Report:
             "views": len(scene.test),
             "machine": machine(),
             "seconds": watch.report(),
-            "outputs": {k: str(v) for k, v in files.items()},
+            "outputs": files,
         }
         write_results(report, files, Path(args.images).resolve().name)
     print_cells(report)
@@ -240,16 +241,14 @@ def write_results(report: Report, files: dict[str, Path], scene: str) -> None:
 
 def print_cells(report: Report) -> None:
     """One line per cell: its first and last row."""
-    names = [cell["checkpoint"] for cell in report["cells"]]
-    width = max(map(len, ["checkpoint", *names]))
+    width = max(len("checkpoint"), *(len(cell["checkpoint"]) for cell in report["cells"]))
     print(f"\n{'checkpoint':<{width}}  range     at the first              at the last")
-    for checkpoint, cell in zip(names, report["cells"], strict=True):
-        ends = [
-            f"{row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}"
-            for row in (cell["rows"][0], cell["rows"][-1])
-        ]
+    for cell in report["cells"]:
         name = "base" if cell["max_sv"] is None else f"[1, {cell['max_sv']:g}]"
-        print(f"{checkpoint:<{width}}  {name:<8}  {ends[0]}    {ends[1]}")
+        line = f"{cell['checkpoint']:<{width}}  {name:<8}"
+        for row in (cell["rows"][0], cell["rows"][-1]):
+            line += f"  {row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}  "
+        print(line.rstrip())
     if report["missing"]:
         print(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
 

@@ -182,7 +182,7 @@ def describe(run: Run, result: Result) -> Report:
             "waiting_seconds": round(adapted.waiting, 3),
             "exchange_seconds": round(adapted.exchanging, 3),
         },
-        "outputs": {name: str(path) for name, path in vars(run.outputs).items()},
+        "outputs": vars(run.outputs),
         "sh_degree": result.gaussians.sh_degree,
         "device": str(device),
         "seconds": run.watch.report(),

@@ -82,8 +82,8 @@ def jsonable(value: Any) -> Any:
         return {jsonable(key): jsonable(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [jsonable(entry) for entry in value]
-    if isinstance(value, str):
-        return as_text(value)
+    if isinstance(value, str | Path):
+        return as_text(str(value))
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

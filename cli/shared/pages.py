@@ -54,9 +54,7 @@ def add_page(
         console.note("the page was interrupted and not written")
     else:
         console.say(f"wrote {path}: open it in a browser")
-        report["outputs"] = report.get("outputs", {}) | {
-            name: str(file) for name, file in written.items()
-        }
+        report["outputs"] = report.get("outputs", {}) | written
 
 
 @dataclass
