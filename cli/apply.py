@@ -2,27 +2,22 @@
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
 
-from clod_adapter.errors import ClodError
+from clod_adapter import ClodError
 from clod_adapter.io.file_formats import check_readable
 
-from .shared.command import add_activated
+from .shared.command import add_activated, add_input, add_out
 from .shared.console import Console
-from .shared.outputs import Outputs, check_ply_name, size
+from .shared.outputs import Outputs, Report, check_ply_name, size
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
+    given = add_input(parser, "base", "BASE.ply", "the checkpoint that was adapted")
     given.add_argument(
         "adapter", metavar="ADAPTER.safetensors", help="the adapter that clod-adapt wrote"
     )
     add_activated(given)
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="OUT.ply", required=True, help="output file; replaced if it exists"
-    )
+    add_out(parser, "OUT.ply", "output file; replaced if it exists", required=True)
 
 
 def check(args: Namespace) -> None:
@@ -38,10 +33,9 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs([Path(args.out)], inputs=[args.base, args.adapter])
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
+    from clod_adapter import load_adapter, save
     from clod_adapter.adapter import dial_tensors
-    from clod_adapter.io.adapter_file import load_adapter
-    from clod_adapter.io.checkpoint import save
 
     from .shared.inputs import read_checkpoint
 

@@ -4,25 +4,21 @@ result.
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import Any
 
-from clod_adapter.errors import ClodError
+from clod_adapter import ClodError
 from clod_adapter.report.charts import check_matplotlib
 
 from . import adapt
-from .shared.command import parser_of
+from .shared.command import add_out, parser_of
 from .shared.console import Console, duration
-from .shared.outputs import AdaptFiles, Outputs, claimed
+from .shared.outputs import AdaptFiles, Outputs, Report, claimed
 
 MAX_SV = 5.0
 PICTURES = {"dial": "dial.png", "curve": "curve.png"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="DIR", default="demo", help="output folder (default: demo)"
-    )
+    add_out(parser, "DIR", "output folder (default: demo)", "demo")
 
 
 def check(args: Namespace) -> None:
@@ -36,7 +32,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs(derived=[*vars(model).values(), *pictures], folders=[folder])
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter.demo import draw, unpack
 
     from .shared.inputs import prepare_kernels
@@ -67,11 +63,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         pictures, drawn = {}, "no figures: the measurements were interrupted"
     print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}\n{drawn}")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
-    return report | {
-        "command": "demo",
-        "folder": str(folder),
-        "pictures": {k: str(v) for k, v in pictures.items()},
-    }
+    return report | {"command": "demo", "folder": folder, "pictures": pictures}
 
 
 DESCRIPTION = """\

@@ -11,6 +11,7 @@ from typing import Any
 from clod_adapter._support.text import first_line
 
 from .shared.console import Console
+from .shared.outputs import Report
 from .view import find_browser
 
 TORCH = "pip install --force-reinstall torch (https://pytorch.org has the command for a GPU)"
@@ -77,7 +78,8 @@ def rendered(device: str, name: str, fix: str) -> Found:
     """Renders sixty Gaussians and compares the image with the reference rasterizer's."""
     import torch
 
-    from clod_adapter.cameras import Camera, intrinsics
+    from clod_adapter import Camera
+    from clod_adapter.cameras import intrinsics
     from clod_adapter.rasterizers import for_device, reference
 
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(7))
@@ -100,9 +102,9 @@ def rendered(device: str, name: str, fix: str) -> Found:
     return True, f"{name}renders the reference image (RMS {error:.0e})", ""
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     """Runs all checks; the report's exit code is 1 where nothing renders."""
-    findings = list[dict[str, Any]]()
+    findings = list[Report]()
     with Console(args.quiet).status("checking ..."), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch's
         for name, check in CHECKS.items():

@@ -6,28 +6,25 @@ from __future__ import annotations
 
 import sys
 from argparse import ArgumentParser, Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
-from functools import partial
-from itertools import product
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from clod_adapter import ClodError, Stopped
 from clod_adapter._support.text import package_version
-from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import file_has_dial
-from clod_adapter.progress import GracefulStop, Listener, Stopped
+from clod_adapter.progress import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console
-from .shared.outputs import Outputs, labels
+from .shared.outputs import Outputs, Report, labels
 
 if TYPE_CHECKING:
-    from clod_adapter.cameras import Scene
+    from clod_adapter import Gaussians, Scene
     from clod_adapter.evaluation.evaluate import Row
     from clod_adapter.evaluation.popping import Popping
-    from clod_adapter.gaussians import Gaussians
 
 PRUNED = "the unadapted base, pruned to the same counts by two rankings"
 MATCHED = "other files, each row followed by the dial value with the same count"
@@ -37,10 +34,8 @@ PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument(
-        "model", metavar="MODEL.ply", help="an adapted file, or a plain one as a baseline"
-    )
+    text = "an adapted file, or a plain one as a baseline"
+    given = common.add_input(parser, "model", "MODEL.ply", text)
     common.add_reading(given)
     dial = parser.add_argument_group("dial values, one of")
     default = (
@@ -83,7 +78,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs([page], charts, inputs=paths(args), scene=args.images)
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter._support.machine import machine
 
     from .shared import measure as measuring
@@ -96,7 +91,8 @@ def execute(args: Namespace) -> dict[str, Any]:
     base = others.pop() if args.base else None
     given = measuring.solve_dials(args, models[0], [view.camera for view in scene.test], console)
     dials = measuring.choose_dials(given, models[0], console)
-    comparisons = Comparisons(model, scene, console, stop)
+    compared: Report = {"base_row": None, "ranked": [], "against": [], "popping": []}
+    comparisons = Comparisons(model, scene, console, stop, compared)
     with stop.listening():
         rows = measuring.measure(model, scene.test, dials, console, stop)
         if not rows:
@@ -111,7 +107,7 @@ def execute(args: Namespace) -> dict[str, Any]:
             if args.popping:
                 comparisons.pop(max(row.virtual_scale for row in rows))
     print(comparisons.text(), end="")
-    report: dict[str, Any] = {  # the page has the first two as well
+    report: Report = {  # the page has the first two as well
         "command": "eval",
         "version": package_version(),
         "model": args.model,
@@ -121,7 +117,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         "views": len(scene.test),
         "rows": [row.as_dict() for row in rows],
         "base": args.base,
-        **comparisons.report,
+        **compared,
         "interrupted": stop.requests > 0,
         "attenuation": asdict(model.attenuation) if model.attenuation else None,
         "notes": console.notes,
@@ -138,19 +134,17 @@ def execute(args: Namespace) -> dict[str, Any]:
     return report
 
 
+@dataclass
 class Comparisons:
     """Comparisons of a model; those that are finished, in ``report`` for --json and as text."""
 
-    def __init__(
-        self, model: Gaussians, scene: Scene, console: Console, stop: GracefulStop
-    ) -> None:
-        self.model = model
-        self.scene = scene
-        self.console = console
-        self.stop = stop
-        self.report: dict[str, Any] = {"base_row": None, "ranked": [], "against": [], "popping": []}
-        self.tables: dict[str, list[tuple[str, Row]]] = {}
-        self.popping: list[tuple[str, Popping]] = []
+    model: Gaussians
+    scene: Scene
+    console: Console
+    stop: GracefulStop
+    report: Report
+    tables: dict[str, list[tuple[str, Row]]] = field(default_factory=dict)
+    popping: list[tuple[str, Popping]] = field(default_factory=list)
 
     def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
         """Measures the base with all its Gaussians, and pruned by two rankings to the counts of
@@ -164,19 +158,19 @@ class Comparisons:
             removal = removal_error(base, views, progress=self.stop.stop_on_signal(meter))
         values = {"opacity": base.opacity_logits, "removal error": removal}
         orders = {by: each.argsort(descending=True, stable=True) for by, each in values.items()}
-        jobs = list(product(rows, orders))
-        with self.console.meter("base") as meter:
-            whole = self._row(base, 1.0, meter.part(0, len(jobs) + 1, "all"))
-            table = self.tables[PRUNED] = [("base", whole)]
-            self.report["base_row"] = whole.as_dict()
-            for i, (ours, by) in enumerate(jobs, 1):
+        whole = self._row(base, 1.0, "base")
+        table = self.tables[PRUNED] = [("base", whole)]
+        self.report["base_row"] = whole.as_dict()
+        for ours in rows:
+            dial = ours.virtual_scale
+            table.append((f"s={dial:g}", ours))
+            for by in orders:
                 pruned = base.select(orders[by][: round(ours.kept)])
-                row = self._row(pruned, 1.0, meter.part(i, len(jobs) + 1, by))
+                row = self._row(pruned, 1.0, f"base by {by}")
                 row = replace(row, kept_share=row.kept / len(base))  # of the whole base
-                model = (f"s={ours.virtual_scale:g}", ours)
-                table += [*([] if model in table else [model]), (by, row)]
+                table.append((by, row))
                 self.report["ranked"].append(
-                    {"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()}
+                    {"virtual_scale": dial, "by": by, "row": row.as_dict()}
                 )
 
     def match(self, others: Mapping[str, Gaussians], rows: Sequence[Row]) -> None:
@@ -185,13 +179,8 @@ class Comparisons:
 
         cameras = [view.camera for view in self.scene.test]
         dials = [row.virtual_scale for row in rows]
-        names = dict(zip(others, labels(list(others)), strict=True))
-        jobs = list[tuple[str, float]]()
-        for path, other in others.items():
-            jobs += [(path, s) for s in (dials if other.sigma_d is not None else [1.0])]
-        with self.console.meter("compare") as meter:
-            for i, (path, s) in enumerate(jobs):
-                other = others[path]
+        for (path, other), label in zip(others.items(), labels(list(others)), strict=True):
+            for s in dials if other.sigma_d is not None else [1.0]:
                 count = mean_kept(other, cameras, s)
                 same = matching_dial(self.model, cameras, count)
                 if abs((kept := mean_kept(self.model, cameras, same)) - count) > CLOSE * count:
@@ -199,15 +188,15 @@ class Comparisons:
                     self.console.note(
                         f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}"
                     )
-                listener = meter.part(i, len(jobs), path)
-                theirs, ours = self._row(other, s, listener), self._row(self.model, same, listener)
+                theirs = self._row(other, s, label)
+                ours = self._row(self.model, same, "model")
                 self.tables.setdefault(MATCHED, []).extend(
-                    [(names[path], theirs), (f"s={ours.virtual_scale:.4g}", ours)]
+                    [(label, theirs), (f"s={same:.4g}", ours)]
                 )
                 self.report["against"].append(
                     {
                         "model": path,
-                        "label": names[path],
+                        "label": label,
                         "theirs": theirs.as_dict(),
                         "ours": ours.as_dict(),
                     }
@@ -222,29 +211,30 @@ class Comparisons:
             )
             return
         test = [view.camera for view in self.scene.test]
-        jobs = list[Any]()
+
+        def sweep(moved: str, popping: Callable[..., Popping], place: Any) -> None:
+            with self.console.meter("popping") as meter:
+                result = popping(
+                    self.model, place, max_sv, progress=self.stop.stop_on_signal(meter)
+                )
+            self.popping.append((moved, result))
+            self.report["popping"].append({"moved": moved, **vars(result)})
+
         for k in range(min(POPPING_VIEWS, len(test))):
             camera = test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)]
-            jobs.append((f"dial, {camera.name}", partial(dial_popping, self.model, camera, max_sv)))
+            sweep(f"dial, {camera.name}", dial_popping, camera)
         cameras = [*test, *(view.camera for view in self.scene.train)]
         ordered = sorted(cameras, key=lambda camera: camera.name)
         # the middle of the capture
         walk = ordered[max((len(ordered) - PATH_CAMERAS) // 2, 0) :][:PATH_CAMERAS]
         if len(walk) > 1:
-            path = partial(path_popping, self.model, walk, max_sv)
-            jobs.append((f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}", path))
-        with self.console.meter("popping") as meter:
-            for i, (moved, sweep) in enumerate(jobs):
-                popping = sweep(progress=self.stop.stop_on_signal(meter.part(i, len(jobs), moved)))
-                self.popping.append((moved, popping))
-                self.report["popping"].append({"moved": moved, **vars(popping)})
+            moved = f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}"
+            sweep(moved, path_popping, walk)
 
-    def _row(self, gaussians: Gaussians, virtual_scale: float, listener: Listener) -> Row:
-        from clod_adapter.evaluation.evaluate import evaluate
+    def _row(self, gaussians: Gaussians, virtual_scale: float, label: str) -> Row:
+        from .shared.measure import measure
 
-        rows = evaluate(
-            gaussians, self.scene.test, [virtual_scale], progress=self.stop.stop_on_signal(listener)
-        )
+        rows = measure(gaussians, self.scene.test, [virtual_scale], self.console, self.stop, label)
         if not rows:
             raise Stopped("stopped within a comparison")
         return rows[0]

@@ -6,16 +6,16 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.settings import WARNING
 
-from .shared.outputs import size
+from .shared.command import add_input
+from .shared.outputs import Report, size
 
 if TYPE_CHECKING:
-    from clod_adapter.calibration import Calibration
-    from clod_adapter.config import AttenuationConfig
+    from clod_adapter import AttenuationConfig, Calibration
     from clod_adapter.inspection.report import Inspection
     from clod_adapter.inspection.statistics import Splat, Spread
 
@@ -26,8 +26,7 @@ LONGEST = 100  # characters of a comment
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument("file", metavar="FILE", help="a splat")
+    add_input(parser, "file", "FILE", "a splat")
     parser.set_defaults(quiet=True)
 
 
@@ -35,7 +34,7 @@ def check(args: Namespace) -> None:
     check_readable(Path(args.file))
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter.inspection.report import inspect
 
     found = inspect(args.file)
@@ -79,17 +78,13 @@ def splat_lines(splat: Splat) -> list[str]:
         more = f", not read: {names}" if splat.extra else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
     lines += _block("says", [comment[:LONGEST] for comment in splat.comments])
-    rows = [
+    rows: list[tuple[str, Spread | None]] = [
         *zip("xyz", splat.position, strict=True),
         ("scale", splat.scale),
         ("opacity", splat.opacity),
     ]
-    rows += [
-        (name, each)
-        for name, each in (("sigma_d", splat.sigma), ("growth_d", splat.growth))
-        if each is not None
-    ]
-    lines += ["", *spread_table(rows), ""]
+    rows += [("sigma_d", splat.sigma), ("growth_d", splat.growth)]
+    lines += spread_table(rows)
     shares = f"{splat.fainter_than_visible:.1%} fainter than 1/255; {splat.needles:.1%} needles"
     lines.append(_line("shares", shares))
     if splat.dial is None:
@@ -98,10 +93,12 @@ def splat_lines(splat: Splat) -> list[str]:
     return lines + calibration_lines(splat.dial.calibration)
 
 
-def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
-    lines = [_line("", ("{:>11}" * 5).format("least", "1 %", "median", "99 %", "greatest"))]
+def spread_table(rows: Sequence[tuple[str, Spread | None]]) -> list[str]:
+    """A table of those that there are, between empty lines."""
+    lines = ["", _line("", ("{:>11}" * 5).format("least", "1 %", "median", "99 %", "greatest"))]
     numbers = "{:>11.4g}" * 5
-    return lines + [_line(name, numbers.format(*astuple(spread))) for name, spread in rows]
+    lines += [_line(name, numbers.format(*astuple(spread))) for name, spread in rows if spread]
+    return [*lines, ""]
 
 
 def calibration_lines(calibration: Calibration | None) -> list[str]:

@@ -11,9 +11,8 @@ from difflib import get_close_matches
 from importlib import import_module
 from types import ModuleType
 
+from clod_adapter import ClodError, Stopped
 from clod_adapter._support.text import as_text, package_version
-from clod_adapter.errors import ClodError
-from clod_adapter.progress import Stopped
 
 from . import adapt
 from .shared import process
@@ -168,7 +167,9 @@ def build_parser(name: str) -> Parser:
     if not name:
         others = "\n".join(f"  {PROG} {word:<10} {summary}" for word, summary in COMMANDS.items())
         parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{adapt.EPILOG}"
-        parser.general.add_argument("--version", action="version")
+        parser.general.add_argument(
+            "--version", action="version", version=f"{PROG} {package_version()}"
+        )
     return parser
 
 

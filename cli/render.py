@@ -4,30 +4,29 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from clod_adapter import ClodError
 from clod_adapter._support.text import file_name, package_version
-from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 from clod_adapter.progress import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console
-from .shared.outputs import Outputs, check_outputs, make_folder
+from .shared.outputs import Outputs, Report, check_outputs, make_folder
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from clod_adapter.cameras import View
-    from clod_adapter.gaussians import Gaussians
+    from clod_adapter import Gaussians, View
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
+    given = common.add_input(parser, "model", "MODEL.ply", "an adapted file, or a plain one")
     common.add_reading(given)
     text = "photographs whose cameras to render: names, all, or held-out (default)"
     given.add_argument("--views", metavar="NAME", nargs="+", default=["held-out"], help=text)
@@ -35,10 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     common.add_dial_options(
         dial, "dial values (default: 1)", "(mean over the images)", several=True
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="FOLDER", required=True, help="output folder; made if missing"
-    )
+    output = common.add_out(parser, "FOLDER", "output folder; made if missing", required=True)
     output.add_argument(
         "--beside", action="store_true", help="put the photograph left of the renders"
     )
@@ -67,7 +63,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs(folders=[Path(args.out)], inputs=[args.model], scene=args.images)
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from .shared.inputs import pick_views, read_inputs
     from .shared.measure import Stopwatch, choose_dials, solve_dials
 
@@ -75,7 +71,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     (model,), scene = read_inputs(args, [args.model], console, held_out=False)
     views = pick_views(scene, args.views)
     images = [out / name for name in image_names(views)]
-    check_outputs(Outputs(derived=images, folders=[out], inputs=[args.model], scene=args.images))
+    check_outputs(replace(outputs(args), derived=images))
     solved = solve_dials(args, model, [view.camera for view in views], console)
     dials = choose_dials(solved or [1.0], model, console)
     gaussians = model.gaussians.without_empty_bands()
@@ -122,7 +118,7 @@ def write_images(
     dials: Sequence[float],
     beside: bool,
     console: Console,
-) -> list[dict[str, Any]]:
+) -> list[Report]:
     """Writes a file per view, until Ctrl-C: the dial values from left to right, after the
     photograph if asked for.
 
@@ -131,10 +127,10 @@ def write_images(
     """
     import torch
 
+    from clod_adapter import render
     from clod_adapter.losses import psnr
-    from clod_adapter.render import render
 
-    written, stop, plain = list[dict[str, Any]](), GracefulStop(), gaussians.sigma_d is None
+    written, stop, plain = list[Report](), GracefulStop(), gaussians.sigma_d is None
     with console.meter("render") as meter, stop.listening():
         for file, view in views:
             with torch.no_grad():
@@ -143,9 +139,7 @@ def write_images(
             write_png(file, torch.cat([view.image, *panels] if beside else panels, dim=1))
             kept = [int(rendering.kept.sum()) for rendering in shown]
             errors = [psnr(rendering.image, view.image) for rendering in shown]
-            written.append(
-                {"view": view.camera.name, "file": str(file), "kept": kept, "psnr": errors}
-            )
+            written.append({"view": view.camera.name, "file": file, "kept": kept, "psnr": errors})
             meter.update(len(written) / len(views), f"{len(written)}/{len(views)}")
             if stop.requests:
                 break

@@ -10,22 +10,21 @@ from argparse import ArgumentParser, Namespace
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from clod_adapter import AdaptConfig, ClodError, Stopped
 from clod_adapter._support.text import as_text, package_version
-from clod_adapter.config import CLASSIC, AdaptConfig
-from clod_adapter.errors import ClodError
+from clod_adapter.config import CLASSIC
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.progress import GracefulStop, Listener, Stopped
+from clod_adapter.progress import GracefulStop, Listener
 from clod_adapter.report.charts import check_matplotlib
 
 from .shared import command as common
 from .shared.console import Console, ProgressDisplay, duration
-from .shared.outputs import Outputs, labels, write_report
+from .shared.outputs import Outputs, Report, labels, write_report
 
 if TYPE_CHECKING:
-    from clod_adapter.cameras import Scene
-    from clod_adapter.io.checkpoint import Checkpoint
+    from clod_adapter import Checkpoint, Scene
 
 
 ADAPTER = ".safetensors"  # suffix
@@ -37,9 +36,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         "ply", metavar="PLY", nargs="+", help="checkpoints of one scene; never modified"
     )
     common.add_reading(given)
-    output = parser.add_argument_group("output")
     text = "output folder; resumed if it exists (default: robustness)"
-    output.add_argument("-o", "--out", metavar="DIR", default="robustness", help=text)
+    common.add_out(parser, "DIR", text, "robustness")
     training = parser.add_argument_group("training")
     text = "largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)"
     training.add_argument(
@@ -90,7 +88,7 @@ class Cell:
     file: Path
 
     @property
-    def key(self) -> dict[str, Any]:
+    def key(self) -> Report:
         """Everything that the result depends on, as JSON."""
         drawn = self.checkpoint.gaussians.screen_filter
         return {
@@ -102,7 +100,7 @@ class Cell:
             **({"screen_filter": repr(drawn)} if drawn != CLASSIC else {}),
         }
 
-    def read(self) -> dict[str, Any] | None:
+    def read(self) -> Report | None:
         """The finished cell, or None if there is none with this key."""
         try:
             cell = json.loads(self.file.read_text(encoding="utf-8"))
@@ -112,11 +110,11 @@ class Cell:
         complete = self.config is None or self.file.with_suffix(ADAPTER).is_file()
         return cell if same and complete else None
 
-    def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
+    def run(self, scene: Scene, progress: Listener) -> Report:
         """Measures; writes the adapter and then the rows."""
+        from clod_adapter import save_adapter
         from clod_adapter._support.machine import machine
         from clod_adapter.evaluation.robustness import adapt_at_range, baseline
-        from clod_adapter.io.adapter_file import save_adapter
 
         base, adapter_file = self.checkpoint, self.file.with_suffix(ADAPTER)
         if self.config is None:
@@ -130,7 +128,7 @@ class Cell:
             "checkpoint": as_text(self.label),
             "max_sv": self.config and self.config.max_sv,
             "rows": result.rows,
-            "adapter": str(adapter_file) if result.adapter else None,
+            "adapter": adapter_file if result.adapter else None,
             "seconds": round(result.seconds, 3),
             "distribution": result.distribution,
             "machine": machine(),
@@ -140,7 +138,7 @@ class Cell:
         return cell
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from clod_adapter._support.machine import machine
     from clod_adapter.evaluation.calibrate import report_dials
     from clod_adapter.evaluation.robustness import BASELINE_SHARES, scene_fingerprint
@@ -188,7 +186,8 @@ def execute(args: Namespace) -> dict[str, Any]:
                 break
         if not found:
             raise Stopped("stopped before the first cell was finished")
-        files, missing = result_files(Path(args.out)), [name for name in cells if name not in found]
+        files = result_files(Path(args.out))
+        missing = [name for name in cells if name not in found]
         report = {
             "command": "robustness",
             "version": package_version(),
@@ -196,7 +195,7 @@ def execute(args: Namespace) -> dict[str, Any]:
             "checkpoints": [
                 {
                     "checkpoint": label,
-                    "model": str(each.path),
+                    "model": each.path,
                     "count": len(each.gaussians),
                     "sha256": each.fingerprint,
                 }
@@ -209,7 +208,7 @@ def execute(args: Namespace) -> dict[str, Any]:
             "views": len(scene.test),
             "machine": machine(),
             "seconds": watch.report(),
-            "outputs": {k: str(v) for k, v in files.items()},
+            "outputs": files,
         }
         write_results(report, files, Path(args.images).resolve().name)
     print_cells(report)
@@ -217,7 +216,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     return report
 
 
-def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) -> None:
+def write_results(report: Report, files: dict[str, Path], scene: str) -> None:
     from clod_adapter.report.robustness_figure import robustness_figure
 
     title = (
@@ -240,18 +239,16 @@ def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) ->
     write_report(files["json"], report)
 
 
-def print_cells(report: dict[str, Any]) -> None:
+def print_cells(report: Report) -> None:
     """One line per cell: its first and last row."""
-    names = [cell["checkpoint"] for cell in report["cells"]]
-    width = max(map(len, ["checkpoint", *names]))
+    width = max(len("checkpoint"), *(len(cell["checkpoint"]) for cell in report["cells"]))
     print(f"\n{'checkpoint':<{width}}  range     at the first              at the last")
-    for checkpoint, cell in zip(names, report["cells"], strict=True):
-        ends = [
-            f"{row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}"
-            for row in (cell["rows"][0], cell["rows"][-1])
-        ]
+    for cell in report["cells"]:
         name = "base" if cell["max_sv"] is None else f"[1, {cell['max_sv']:g}]"
-        print(f"{checkpoint:<{width}}  {name:<8}  {ends[0]}    {ends[1]}")
+        line = f"{cell['checkpoint']:<{width}}  {name:<8}"
+        for row in (cell["rows"][0], cell["rows"][-1]):
+            line += f"  {row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}  "
+        print(line.rstrip())
     if report["missing"]:
         print(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
 

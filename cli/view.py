@@ -12,21 +12,16 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from clod_adapter import ClodError, Stopped
 from clod_adapter._support.text import package_version
-from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS, check_readable
-from clod_adapter.origin import Origin
-from clod_adapter.progress import Stopped
 
 from .shared import command as common
 from .shared.console import Console
-from .shared.outputs import jsonable
+from .shared.outputs import Report, jsonable
 from .shared.process import interrupt_as_stopped
-
-if TYPE_CHECKING:
-    from clod_adapter.io.checkpoint import Checkpoint
 
 MODEL, BASE, CONVERTER = "/files/model", "/files/base", "/convert"
 # they would take over the terminal
@@ -120,7 +115,7 @@ def execute(args: Namespace) -> None:
         console.say("ended")
 
 
-def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[str, Any]]:
+def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], Report]:
     """What the server answers by path, and the report."""
     from clod_adapter.viewer.page import (
         Payload,
@@ -132,25 +127,20 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
     )
     from clod_adapter.viewer.server import MOST_BYTES, Response
 
-    from .shared.inputs import read_cameras, read_checkpoint, with_filter
+    from .shared.inputs import read_cameras, read_model
     from .shared.measure import solve_dials
-
-    def read(path: str, origin: Origin | None = None) -> Checkpoint:
-        return with_filter(read_checkpoint(path, console, args.activated, origin), args, console)
 
     def answer(payload: Payload) -> Response:
         return Response("application/octet-stream", payload.size, payload.blocks)
 
     def convert(path: Path) -> Response:
         """A file that was dropped on the page."""
-        quiet = Console(quiet=True)
-        checkpoint = read_checkpoint(str(path), quiet, args.activated)
-        return answer(Payload.of(with_filter(checkpoint, args, quiet)))
+        return answer(Payload.of(read_model(args, str(path), Console(quiet=True))))
 
     files = view_files(args.models)
-    model = read(files[0])
-    models = [model, *(read(path, model.origin) for path in files[1:])]
-    base = read(args.base, model.origin) if args.base else None
+    model = read_model(args, files[0], console)
+    models = [model, *(read_model(args, path, console, model.origin) for path in files[1:])]
+    base = read_model(args, args.base, console, model.origin) if args.base else None
     if args.device_preset and args.images is None and not model.viewpoints:
         raise ClodError(
             f"{model.path}: stores no cameras, which --device-preset needs; give --images"

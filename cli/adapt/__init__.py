@@ -3,29 +3,35 @@
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from clod_adapter.errors import ClodError
+from clod_adapter import ClodError
 
-from ..shared.command import add_reading, add_settings, check_inputs, make_config, page_files
-from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
+from ..shared.command import (
+    add_input,
+    add_out,
+    add_reading,
+    add_settings,
+    check_inputs,
+    make_config,
+    page_files,
+)
+from ..shared.outputs import AdaptFiles, Outputs, Report, check_ply_name
 
 # As in clod_adapter.training.plan, which imports torch; a test compares the two.
 NAMES = ("bands", "means", "quats", "scales", "opacities", "sh0")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
     text = (
         "checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never"
         " modified"
     )
-    given.add_argument("ply", metavar="PLY", help=text)
+    given = add_input(parser, "ply", "PLY", text)
     scene = (
         "images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or instant-ngp"
     )
     add_reading(given, f"scene folder: {scene} (default: none, see below)")
-    output = parser.add_argument_group("output")
     text = "output file (default: name of PLY with _clod, in the current folder)"
-    output.add_argument("-o", "--out", metavar="OUT.ply", help=text)
+    output = add_out(parser, "OUT.ply", text)
     output.add_argument(
         "--report", action="store_true", help="also write a page, OUT.html, and its charts"
     )
@@ -68,7 +74,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs(named, derived, inputs=[args.ply], scene=args.images)
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from .run import adapt
 
     return adapt(args)

@@ -8,10 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from clod_adapter import AdaptConfig, ClodError, Progress, Stopped
 from clod_adapter._support.text import package_version
-from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.progress import GracefulStop, Listener, Progress, Stopped
+from clod_adapter.progress import GracefulStop, Listener
 from clod_adapter.training.state import StateRejected, TrainingState, load_state, save_state
 
 from ..shared.command import SETTINGS, as_option

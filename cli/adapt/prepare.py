@@ -12,29 +12,35 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from clod_adapter import (
+    Checkpoint,
+    Decision,
+    Gaussians,
+    Override,
+    Plan,
+    Scene,
+    Stopped,
+    View,
+    make_plan,
+)
 from clod_adapter._kernels.memory import release
 from clod_adapter.adapter import dial_tensors
-from clod_adapter.cameras import Scene, View
 from clod_adapter.evaluation.calibrate import report_dials
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.robustness import scene_fingerprint
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.progress import GracefulStop, Stopped
+from clod_adapter.progress import GracefulStop
 from clod_adapter.training.loop import time_steps
-from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
-from clod_adapter.training.planner import make_plan
+from clod_adapter.training.plan import NOT_NEEDED
 from clod_adapter.training.pseudo_views import with_pseudo_views
 
 from ..shared import inputs
 from ..shared.command import make_config
-from ..shared.console import Console, ProgressDisplay
+from ..shared.console import Console, ProgressDisplay, duration
 from ..shared.measure import Stopwatch, measure
-from ..shared.outputs import AdaptFiles
+from ..shared.outputs import AdaptFiles, Report, size
 from ..shared.pages import SNAPSHOT_VIEWS
 from ..shared.process import launched
 from .listeners import Saver
@@ -54,11 +60,11 @@ class Run:
     base: Checkpoint
     scene: Scene
     # the measurements of the check; None without photographs
-    alignment: dict[str, Any] | None = None
+    alignment: Report | None = None
     base_rows: list[Row]  # at dial value 1; none if nothing is held out
     base_seconds = 0.0  # of measuring it
     cut = True  # whether the measurements of the result are missing or incomplete
-    forecast: dict[str, Any] | None = None
+    forecast: Report | None = None
     forecast_at = 0.0
 
     def __init__(self, args: argparse.Namespace) -> None:
@@ -96,17 +102,13 @@ class Run:
         if base.gaussians.screen_filter.compensate:
             with watch.time("kernels"):
                 inputs.prepare_kernels(console, device, screen_filter=base.gaussians.screen_filter)
-        with watch.time("place" if photographs is None else "evaluate"):
-            self.place(photographs)
+        with (
+            watch.time("place" if photographs is None else "evaluate"),
+            closing(ProgressDisplay(console, self.stop)) as display,
+        ):
+            self.scene = with_pseudo_views(base.gaussians, photographs, self.config.seed, display)
+        console.note(*self.scene.notes)
         self.config = self.config.for_views(len(self.scene.train))
-
-    def place(self, photographs: Scene | None) -> None:
-        """Adds pseudo views where photographs are few, and replaces them where there are none."""
-        with closing(ProgressDisplay(self.console, self.stop)) as display:
-            self.scene = with_pseudo_views(
-                self.base.gaussians, photographs, self.config.seed, display
-            )
-        self.console.note(*self.scene.notes)
 
     def identify(self) -> None:
         """Refuses the state of another run."""
@@ -183,14 +185,13 @@ def forecast(run: Run, plan: Plan) -> None:
         )
         peak += 7 * _bytes(plan.start.without_bands(0))
     seconds = training + measuring + _bytes(base.gaussians) / WRITING
-    minutes = f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
-    memory = f", {in_words(peak)}" if peak else ""
-    run.console.say(f"forecast: {minutes}{memory} ({steps:,} steps)")
+    memory = f", {size(peak)}" if peak else ""
+    run.console.say(f"forecast: {duration(seconds)}{memory} ({steps:,} steps)")
     run.forecast_at = time.perf_counter()
     run.forecast = {"seconds": round(seconds, 1), "bytes": peak, "steps": steps}
 
 
-def against_forecast(run: Run) -> dict[str, Any] | None:
+def against_forecast(run: Run) -> Report | None:
     """The forecast, and what the run has taken since."""
     taken = {
         "actual_seconds": round(time.perf_counter() - run.forecast_at, 1),
@@ -210,23 +211,16 @@ def peak_bytes() -> int:
 
 
 def show_plan(decisions: Sequence[Decision], console: Console) -> None:
-    rows = [(d.what, d.verdict, d.measured, d.name) for d in decisions if d.verdict != NOT_NEEDED]
-    a, b, c = (
-        (max(map(len, column)) for column in list(zip(*rows, strict=True))[:3])
-        if rows
-        else (0, 0, 0)
-    )
+    needed = [each for each in decisions if each.verdict != NOT_NEEDED]
+    width = max((len(each.what) for each in needed), default=0)
     console.say("plan: action, measured effect, option that overrides it; reasons in the report")
-    for what, verdict, effect, name in rows:
+    for each in needed:
+        what, verdict, name = each.what, each.verdict, each.name
         option = f"{'--without' if verdict == 'kept' else '--with'} {name}" if name else ""
-        console.say(f"  {what:<{a}}  {verdict:<{b}}  {effect:>{c}}  {option}".rstrip())
+        line = f"  {what:<{width}}  {verdict:<10}  {each.measured:>14}  {option}"
+        console.say(line.rstrip())
     if others := [each.what for each in decisions if each.verdict == NOT_NEEDED]:
         console.say(f"  does not apply: {', '.join(others)}")
-
-
-def in_words(count: float) -> str:
-    """``3.14 GB``, ``500 MB``, ``1234.5 GB``."""
-    return f"{round(count / 1e9, 2):g} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 def _bytes(gaussians: Gaussians) -> int:

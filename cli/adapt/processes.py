@@ -15,11 +15,8 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import torch
 
-from clod_adapter.cameras import Scene, View
-from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import GracefulStop, Stopped
+from clod_adapter import AdaptConfig, ClodError, Gaussians, Plan, Scene, Stopped, View, adapt
+from clod_adapter.progress import GracefulStop
 from clod_adapter.training.distributed import (
     PATIENCE,
     ProcessGroup,
@@ -27,8 +24,6 @@ from clod_adapter.training.distributed import (
     joined,
     require_distributed,
 )
-from clod_adapter.training.loop import adapt
-from clod_adapter.training.plan import Plan
 from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState
 

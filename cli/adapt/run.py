@@ -6,22 +6,20 @@ import argparse
 import shlex
 from contextlib import closing
 from dataclasses import asdict, replace
-from typing import Any
 
+from clod_adapter import Plan, Progress, Result, detach
 from clod_adapter._kernels.memory import release
 from clod_adapter._support.machine import machine
 from clod_adapter._support.text import package_version
-from clod_adapter.adapter import detach
 from clod_adapter.evaluation.calibrate import report_dials
 from clod_adapter.io.atomic import atomic_paths
-from clod_adapter.pipeline import Result, calibrated, extract_result
-from clod_adapter.progress import GracefulStop, Progress
-from clod_adapter.training.plan import Plan
+from clod_adapter.pipeline import calibrated, extract_result
+from clod_adapter.progress import GracefulStop
 from clod_adapter.training.state import Adapted
 
 from ..shared.console import ProgressDisplay, duration
 from ..shared.measure import by_dial, comparable, measure, table
-from ..shared.outputs import size, write_report
+from ..shared.outputs import Report, size, write_report
 from ..shared.pages import AdaptPage
 from ..shared.process import ignore_signals, launched
 from .prepare import Run, against_forecast, decide, forecast
@@ -32,7 +30,7 @@ from .processes import BACKENDS, explain, must_exit_soon, training_group
 LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
 
 
-def adapt(args: argparse.Namespace) -> dict[str, Any]:
+def adapt(args: argparse.Namespace) -> Report:
     """Plans, trains, writes and reports."""
     run = Run(args)
     run.read()
@@ -82,7 +80,7 @@ def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
     return replace(result, base_rows=run.base_rows)
 
 
-def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
+def finish(run: Run, result: Result, page: AdaptPage | None) -> Report:
     """Measures the result, writes it once, and returns the report."""
     interrupted, console, outputs = result.adapted.interrupted, run.console, run.outputs
     # After a Ctrl-C that ended training the next one aborts, as its message says.
@@ -132,7 +130,7 @@ def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
     return result if run.cut or not rows else calibrated(result, console.say)
 
 
-def write_result(run: Run, result: Result) -> dict[str, Any]:
+def write_result(run: Run, result: Result) -> Report:
     """Writes the three files, all before the first replaces that of an earlier run, and returns the
     report.
     """
@@ -150,7 +148,7 @@ def write_result(run: Run, result: Result) -> dict[str, Any]:
     return report
 
 
-def describe(run: Run, result: Result) -> dict[str, Any]:
+def describe(run: Run, result: Result) -> Report:
     """The report, except the calibration and the sizes of the files."""
     args, adapted, adapter = run.args, result.adapted, result.adapter
     times, count, device = result.plan.seconds, launched().size, result.gaussians.means.device
@@ -184,7 +182,7 @@ def describe(run: Run, result: Result) -> dict[str, Any]:
             "waiting_seconds": round(adapted.waiting, 3),
             "exchange_seconds": round(adapted.exchanging, 3),
         },
-        "outputs": {name: str(path) for name, path in vars(run.outputs).items()},
+        "outputs": vars(run.outputs),
         "sh_degree": result.gaussians.sh_degree,
         "device": str(device),
         "seconds": run.watch.report(),

@@ -6,15 +6,14 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from itertools import pairwise
 from math import inf
 from pathlib import Path
-from typing import Any
 
+from clod_adapter import ClodError
 from clod_adapter.config import MULTIPLIER
-from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import file_has_dial
 from clod_adapter.io.formats.splat_transform import SplatTransform
 
 from ..shared import command as common
-from ..shared.outputs import Outputs
+from ..shared.outputs import Outputs, Report
 from .names import FOLDERS, FORMATS, PACKED, PAGE, is_page, level_paths, suffix_of
 
 DIGITS = 6  # significant digits of a level, all of them in its file's name
@@ -34,8 +33,8 @@ def levels_of(text: str) -> list[float]:
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    given = parser.add_argument_group("input")
-    given.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
+    text = "an adapted file, or a plain one to convert"
+    given = common.add_input(parser, "model", "MODEL", text)
     given.add_argument(
         "others", metavar="OTHER", nargs="*", help=f"more of them, to switch to in an {PAGE} page"
     )
@@ -51,10 +50,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     values.add_argument(
         "--levels", metavar="S,S,...", type=levels_of, help="dial values, each baked into a file"
     )
-    output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="OUT", required=True, help="output file; its suffix is the format"
-    )
+    text = "output file; its suffix is the format"
+    output = common.add_out(parser, "OUT", text, required=True)
     sets = output.add_mutually_exclusive_group()
     for option, form in (
         ("--lod-meta", "streaming set for PlayCanvas's viewers"),
@@ -192,7 +189,7 @@ def outputs(args: Namespace) -> Outputs:
     )
 
 
-def execute(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> Report:
     from .files import export
 
     return export(args)

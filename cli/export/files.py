@@ -6,34 +6,35 @@ from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
-from typing import Any
 
-import torch
-
-from clod_adapter.bake import Level, bake, bake_levels, order_by_extinction
+from clod_adapter import (
+    Camera,
+    ClodError,
+    Gaussians,
+    bake,
+    bake_levels,
+    order_by_extinction,
+    place_cameras,
+    render,
+)
+from clod_adapter.bake import Level
 from clod_adapter.calibration import Viewpoint
-from clod_adapter.cameras import Camera, spread
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.cameras import spread
 from clod_adapter.harmonics import with_sh_degree
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
-from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.file_formats import WRITABLE, write
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.io.settings import Metadata
 from clod_adapter.losses import psnr
-from clod_adapter.origin import Origin
-from clod_adapter.render import render
-from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page
 
 from ..shared import inputs
 from ..shared.command import given_budget, initial_dial
 from ..shared.console import Console, duration
 from ..shared.measure import Stopwatch, choose_dials, solve_dials
-from ..shared.outputs import size
+from ..shared.outputs import Report, size
 from .names import FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 
 PLACED = 16  # cameras placed where none are known
@@ -51,7 +52,7 @@ SETTINGS = {
 COMPARED = 4  # views on which a page is compared with the exact values
 
 
-def export(args: Namespace) -> dict[str, Any]:
+def export(args: Namespace) -> Report:
     """Reads, bakes and writes; prints what was written, and returns the report."""
     watch, export = Stopwatch(), Export(args)
     export.note_losses()
@@ -85,7 +86,7 @@ def export(args: Namespace) -> dict[str, Any]:
     }
 
 
-def line_of(output: dict[str, Any], total: int) -> str:
+def line_of(output: Report, total: int) -> str:
     """Describes an output of a model of ``total`` Gaussians in a line."""
     line = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,}"
     if levels := output.get("levels"):
@@ -110,8 +111,11 @@ class Export:
         self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
         times = args.images is not None and args.fps
         device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
-        self.model = self._read(args.model, device)
-        self.others = [self._read(path, device, self.model.origin) for path in args.others]
+        self.model = inputs.read_model(args, args.model, self.console, device=device)
+        self.others = [
+            inputs.read_model(args, path, self.console, self.model.origin, device)
+            for path in args.others
+        ]
         # to bake or fit for, none where nothing is; in printable ASCII
         self.cameras, self.about = self._find_cameras()
         reads = self.page and args.images is not None  # cameras of the scene, for a page
@@ -132,11 +136,6 @@ class Export:
         elif dials:
             dials = choose_dials(dials, self.model, self.console)
         self.dials: list[float] = dials or []  # which are baked, or the one at which a page opens
-
-    def _read(self, path: str, device: torch.device, origin: Origin | None = None) -> Checkpoint:
-        activated = self.args.activated
-        read = inputs.read_checkpoint(path, self.console, activated, origin, device)
-        return inputs.with_filter(read, self.args, self.console)
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they
@@ -224,21 +223,21 @@ class Export:
                 ' for it: antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
             )
 
-    def write(self) -> list[dict[str, Any]]:
+    def write(self) -> list[Report]:
         """Writes all files of the command, all or none; a description of each."""
-        out, written = Path(self.args.out), list[dict[str, Any]]()
+        out, written = Path(self.args.out), list[Report]()
         if option := self.args.folder:
             with atomic_path(out) as folder:
                 folder.mkdir()
                 found = self._write_set(folder / FOLDERS[option])
                 taken = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-            levels = [{"begins": level.begins, "count": len(level.gaussians)} for level in found]
-            counts = [level["count"] for level in levels]
             return [
                 {
                     "file": str(out / FOLDERS[option]),
-                    "levels": levels,
-                    "count": sum(counts),
+                    "levels": [
+                        {"begins": level.begins, "count": len(level.gaussians)} for level in found
+                    ],
+                    "count": sum(len(level.gaussians) for level in found),
                     "bytes": taken,
                 }
             ]
@@ -317,13 +316,14 @@ class Export:
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Notes the PSNR of its renders against those of the exact Gaussians."""
         inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
-        how: dict[str, Any] = {
-            "others": self.others,
-            "cameras": self.views,
-            "virtual_scale": virtual_scale,
-            "exact": self.args.exact,
-        }
-        shown, losses = write_viewer_page(path, self.model, **how)
+        shown, losses = write_viewer_page(
+            path,
+            self.model,
+            others=self.others,
+            cameras=self.views,
+            virtual_scale=virtual_scale,
+            exact=self.args.exact,
+        )
         self.console.note(*losses)
         if self.args.exact:
             return

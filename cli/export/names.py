@@ -4,7 +4,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
-from clod_adapter.errors import ClodError
+from clod_adapter import ClodError
 from clod_adapter.io import file_formats
 from clod_adapter.io.file_formats import Format
 

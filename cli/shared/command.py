@@ -12,17 +12,9 @@ from pathlib import Path
 from site import getuserbase
 from typing import Any, NoReturn
 
-from clod_adapter._support.text import package_version
-from clod_adapter.config import (
-    DEVICES,
-    FILTERS,
-    PLACED_MAX_SV,
-    AdaptConfig,
-    AttenuationConfig,
-    field_descriptions,
-)
-from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
+from clod_adapter import AdaptConfig, AttenuationConfig, ClodError
+from clod_adapter.config import DEVICES, FILTERS, PLACED_MAX_SV, field_descriptions
+from clod_adapter.io.file_formats import check_readable, file_has_dial
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import QUANTITIES, chart_file, check_matplotlib
 
@@ -70,11 +62,6 @@ class Parser(ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise ClodError(f"{message} (see {self.prog} --help)")
 
-    @property
-    def version(self) -> str:
-        """The text of --version."""
-        return f"{self.prog} {package_version()}"
-
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Exits after --help and --version."""
         check_printed()
@@ -117,10 +104,20 @@ rate that is out of reach is an error.
 """
 
 
-def no_calibration(model: Path, option: str, why: str = "") -> ClodError:
-    """The error of a budget that needs a calibration."""
-    why = why or "there is no calibration in the header"
-    return ClodError(f"{model}: {option}: {why}; adapt it again, or give --sv or --keep")
+def add_input(parser: ArgumentParser, name: str, metavar: str, text: str) -> _ActionsContainer:
+    """Adds the group of what is read, with the file that every command has; returns it."""
+    given = parser.add_argument_group("input")
+    given.add_argument(name, metavar=metavar, help=text)
+    return given
+
+
+def add_out(
+    parser: ArgumentParser, metavar: str, text: str, default: str | None = None, **more: Any
+) -> _ActionsContainer:
+    """Adds the group of what is written, with ``--out``; returns it."""
+    output = parser.add_argument_group("output")
+    output.add_argument("-o", "--out", metavar=metavar, default=default, help=text, **more)
+    return output
 
 
 def add_activated(options: _ActionsContainer) -> None:
@@ -234,15 +231,6 @@ def check_dials(args: Namespace, model: str) -> None:
         raise ClodError(
             f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ..."
         )
-    if name == "psnr_drop" and format_of(Path(model)) is PLY:
-        from clod_adapter.io.ply import read_head  # here: --help needs no plyfile
-        from clod_adapter.io.ply_layout import PREFIX
-
-        if not any(
-            comment.startswith(f"{PREFIX}calibrated ")
-            for comment in read_head(Path(model)).comments
-        ):
-            raise no_calibration(Path(model), option)
 
 
 def check_inputs(scene: str | None, *paths: str) -> None:

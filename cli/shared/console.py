@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from clod_adapter import Phase, Progress
 from clod_adapter.io.settings import WARNING
-from clod_adapter.progress import GracefulStop, Listener, Phase, Progress
+from clod_adapter.progress import GracefulStop
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -116,10 +117,6 @@ class Meter:
     def __call__(self, now: Progress) -> bool | None:
         self.update(now.share, f"{now.done}/{now.total}")
         return None
-
-    def part(self, index: int, count: int, text: str) -> Listener:
-        """The listener of the ``index``-th of ``count`` equal parts."""
-        return lambda now: self.update((index + now.share) / count, text)
 
     def close(self) -> None:
         if self.bar is not None:

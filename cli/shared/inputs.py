@@ -7,30 +7,39 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path, PureWindowsPath
-from typing import Any
 
 import torch
 from numba.core.event import Event, Listener, install_listener
 
+from clod_adapter import (
+    AdaptConfig,
+    Camera,
+    Checkpoint,
+    ClodError,
+    Gaussians,
+    Phase,
+    Scene,
+    ScreenFilter,
+    Stopped,
+    View,
+    adapt,
+    evaluate,
+    load,
+    load_scene,
+)
 from clod_adapter._support.text import first_line
 from clod_adapter.alignment.align import WORDS, align, compare_frames, detect_filter
 from clod_adapter.alignment.check import MOST_VIEWS
 from clod_adapter.alignment.search import camera_in
-from clod_adapter.cameras import Camera, Scene, View, with_near_planes
-from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, ScreenFilter
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint, load
-from clod_adapter.io.scene.load import load_cameras, load_scene
-from clod_adapter.io.values import Activated, dial_columns
+from clod_adapter.cameras import with_near_planes
+from clod_adapter.config import CLASSIC, FILTERS
+from clod_adapter.io.scene.load import load_cameras
+from clod_adapter.io.values import Activated
 from clod_adapter.origin import Origin
-from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cuda import unusable
-from clod_adapter.training.loop import adapt
 
 from .console import Console
-from .outputs import size
+from .outputs import Report, size
 
 CPU = torch.device("cpu")
 
@@ -45,15 +54,24 @@ def read_checkpoint(
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
-    columns, drawn = " and ".join(dial_columns(gaussians.tensors())), gaussians.screen_filter
-    more = f", with {columns}" * bool(columns)
-    more += f", drawn with {drawn.description}" * (drawn != CLASSIC)
-    far = f" and {len(gaussians) - gaussians.whole:,} far" if gaussians.near is not None else ""
-    console.say(
-        f"{path}: {gaussians.whole:,}{far} Gaussians, SH degree {gaussians.sh_degree}{more}"
-    )
+    drawn = gaussians.screen_filter
+    more = "" if drawn == CLASSIC else f", drawn with {drawn.description}"
+    console.say(f"{path}: Gaussians: {gaussians.summary}{more}")
     console.note(*checkpoint.notes, of=path)
     return replace(checkpoint, gaussians=gaussians.to(device))
+
+
+def read_model(
+    args: argparse.Namespace,
+    path: str,
+    console: Console,
+    origin: Origin | None = None,
+    device: torch.device = CPU,
+) -> Checkpoint:
+    """The checkpoint as the options for reading say, without photographs to compare with."""
+    return with_filter(
+        read_checkpoint(path, console, args.activated, origin, device), args, console
+    )
 
 
 def read_scene(folder: str, console: Console, origin: Origin) -> Scene:
@@ -233,7 +251,7 @@ SMALL = 320  # pixels, width of photographs that only tell the frame
 
 def align_shown(
     checkpoint: Checkpoint, scene: Scene, console: Console, *, required: bool
-) -> tuple[Scene, dict[str, Any]]:
+) -> tuple[Scene, Report]:
     """``align``, with a status line on a terminal."""
     with console.status("comparing the checkpoint with the photographs ..."):
         override = "use --misaligned-ok"

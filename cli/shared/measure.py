@@ -6,18 +6,25 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from clod_adapter import (
+    Camera,
+    Checkpoint,
+    ClodError,
+    Gaussians,
+    Phase,
+    Stopped,
+    View,
+    dial_for,
+    evaluate,
+)
 from clod_adapter.calibration import Viewpoint
-from clod_adapter.cameras import Camera, View
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
+from clod_adapter.evaluation.budget import dial_for_times, frame_times
 from clod_adapter.evaluation.calibrate import with_frame_times
-from clod_adapter.evaluation.evaluate import Row, evaluate
+from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.popping import Popping
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.progress import GracefulStop, Phase, Stopped
+from clod_adapter.progress import GracefulStop
 
-from .command import given_budget, no_calibration
+from .command import given_budget
 from .console import Console
 from .inputs import prepare_kernels
 
@@ -168,8 +175,9 @@ def solve_dials(
             *notes,
         )
     elif name != "keep" and calibration is None:
-        why = next((note for note in model.notes if "calibration" in note), "")
-        raise no_calibration(model.path, option, why)
+        none = "there is no calibration in the header"
+        why = next((note for note in model.notes if "calibration" in note), none)
+        raise ClodError(f"{model.path}: {option}: {why}; adapt it again, or give --sv or --keep")
     elif name == "fps" and calibration is not None:
         machine = (
             f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
@@ -182,14 +190,13 @@ def solve_dials(
     dials = []
     for value in values:
         asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
-        wanted: dict[str, Any] = {
-            name: value,
-            "cameras": cameras,
-            "calibration": calibration,
-            "baked": baked,
-        }
+        wanted: dict[str, Any] = {name: value, "cameras": cameras, "baked": baked}
         try:
-            solved = dial_for_times(times, value) if times else dial_for(model.gaussians, **wanted)
+            solved = (
+                dial_for_times(times, value)
+                if times
+                else dial_for(model.gaussians, calibration=calibration, **wanted)
+            )
         except ClodError as error:
             raise ClodError(f"{asked}: {error}{machine}") from error
         dials.append(solved.virtual_scale)

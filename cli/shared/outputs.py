@@ -15,12 +15,15 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from clod_adapter import ClodError
 from clod_adapter._support.text import as_text
-from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path, check_target, output_lock, remove_leftovers
 from clod_adapter.io.file_formats import check_suffix, read_source
 from clod_adapter.io.ranks import ranks_of
 from clod_adapter.io.scene.folder import scene_files
+
+# What --json prints, and parts of it.
+Report = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,10 @@ def labels(paths: Sequence[str]) -> list[str]:
 
 
 def size(of: Path | int) -> str:
-    """The size of a file, or a number of bytes, as text: ``4 kB``, ``12.3 MB``."""
+    """The size of a file, or a number of bytes, as text: ``4 kB``, ``12.3 MB``, ``3.1 GB``."""
     count = of if isinstance(of, int) else of.stat().st_size
+    if count >= 1e9:
+        return f"{count / 1e9:.1f} GB"
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{max(count / 1e3, 1):.0f} kB"
 
 
@@ -77,12 +82,12 @@ def jsonable(value: Any) -> Any:
         return {jsonable(key): jsonable(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [jsonable(entry) for entry in value]
-    if isinstance(value, str):
-        return as_text(value)
+    if isinstance(value, str | Path):
+        return as_text(str(value))
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_report(path: Path, report: dict[str, Any]) -> None:
+def write_report(path: Path, report: Report) -> None:
     with atomic_path(path) as temporary:
         text = json.dumps(jsonable(report), indent=2, allow_nan=False, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8")

@@ -1,24 +1,29 @@
 """``--report``: renders the images of a run's page; its rows are those of the report."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
-from clod_adapter.cameras import Scene, View
-from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
+from clod_adapter import (
+    AdaptConfig,
+    ClodError,
+    Gaussians,
+    Phase,
+    Progress,
+    Scene,
+    Stopped,
+    View,
+    evaluate,
+    render,
+)
 from clod_adapter.losses import psnr
-from clod_adapter.progress import Phase, Progress, Stopped
-from clod_adapter.render import render
 from clod_adapter.report.page import Picture, from_checkpoint, write_page
 
 from .console import Console
-from .outputs import jsonable
+from .outputs import Report, jsonable
 from .process import interrupt_as_stopped
 
 FRAMES = 13  # positions of the page's slider
@@ -29,12 +34,12 @@ SNAPSHOT_VIEWS = 12  # held-out views that snapshots are measured on, at most
 
 def add_page(
     path: Path,
-    report: dict[str, Any],
+    report: Report,
     model: Gaussians,
     base: Gaussians | None,
     scene: Scene,
     console: Console,
-    training: Callable[[], dict[str, Any] | None] = lambda: None,
+    training: Callable[[], Report | None] = lambda: None,
 ) -> None:
     """Writes the page and adds its files to the report, unless Ctrl-C stops it, which a note
     says.
@@ -49,34 +54,30 @@ def add_page(
         console.note("the page was interrupted and not written")
     else:
         console.say(f"wrote {path}: open it in a browser")
-        report["outputs"] = report.get("outputs", {}) | {
-            name: str(file) for name, file in written.items()
-        }
+        report["outputs"] = report.get("outputs", {}) | written
 
 
+@dataclass
 class AdaptPage:
     """Copies the result so far during training, and measures the copies after its end, for the
     page.
     """
 
-    def __init__(
-        self, base: Gaussians, scene: Scene, config: AdaptConfig, console: Console
-    ) -> None:
-        self.base = base
-        self.scene = scene
-        self.config = config
-        self.console = console
-        self.due = [0.0, *SNAPSHOTS]
-        # seconds of the training, and the state then
-        self.snapshots: list[tuple[float, Gaussians]] = []
-        self.trained = 0.0
+    base: Gaussians
+    scene: Scene
+    config: AdaptConfig
+    console: Console
+    due: tuple[float, ...] = (0.0, *SNAPSHOTS)
+    # seconds of the training, and the state then
+    snapshots: list[tuple[float, Gaussians]] = field(default_factory=list)
+    trained = 0.0
 
     def __call__(self, now: Progress, whole: Callable[[Gaussians], Gaussians]) -> None:
         """Listens; ``whole`` is given the Gaussians that are trained, and returns all."""
         if now.phase == Phase.TRAINING and now.gaussians is not None:
             self.trained = now.seconds
             if self.due and now.share >= self.due[0]:
-                self.due = [share for share in self.due if share > now.share]
+                self.due = tuple(share for share in self.due if share > now.share)
                 state = whole(now.gaussians())
                 # The largest, if it is not trained; far Gaussians have their own.
                 fixed = (
@@ -91,9 +92,7 @@ class AdaptPage:
                 }
                 self.snapshots.append((now.seconds, state.replace(**changing, **fixed)))
 
-    def write(
-        self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float
-    ) -> None:
+    def write(self, path: Path, report: Report, result: Gaussians, start_seconds: float) -> None:
         """The same of a run, whose other files are written: the disk stops the page alone, which a
         note says.
         """
@@ -103,7 +102,7 @@ class AdaptPage:
         except ClodError as error:
             self.console.note(f"the page was not written: {error}")
 
-    def _training(self, result: Gaussians, start_seconds: float) -> dict[str, Any] | None:
+    def _training(self, result: Gaussians, start_seconds: float) -> Report | None:
         """Held-out PSNR of the copies and of the result, at s = 1, 3 and the largest."""
         if not (self.scene.test and self.snapshots):
             return None
@@ -112,7 +111,7 @@ class AdaptPage:
         if self.snapshots[-1][0] == self.trained:  # the result itself
             self.snapshots.pop()
         states = [*self.snapshots, (self.trained, result)]
-        curves: list[dict[str, Any]] = [
+        curves: list[Report] = [
             {"label": f"s = {s:g}", "virtual_scale": s, "points": []} for s in dials
         ]
         with self.console.meter("snapshots") as meter:

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stderr, redirect_stdout
 from typing import Any, NamedTuple, TextIO
 
-from clod_adapter.errors import ClodError
-from clod_adapter.progress import ENDING, Stopped, handled_by
+from clod_adapter import ClodError, Stopped
+from clod_adapter.progress import ENDING, handled_by
 
 
 class Stream:

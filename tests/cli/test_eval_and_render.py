@@ -17,9 +17,9 @@ from clod_adapter import evaluate, load_scene, render
 from clod_adapter.cli import render as command
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
+from clod_adapter.cli.shared import measure
 from clod_adapter.cli.shared.command import DEVICES
 from clod_adapter.evaluation import calibrate, frame_times
-from clod_adapter.evaluation import evaluate as module
 from clod_adapter.evaluation.frame_times import FrameTimes
 from clod_adapter.io.checkpoint import load, save
 from runs import names, pressing
@@ -106,7 +106,7 @@ def test_against_at_matched_counts(clod, capture, attenuated, tmp_path):
 
 
 def test_interrupt_keeps_finished_comparisons(clod, monkeypatch):
-    monkeypatch.setattr(module, "evaluate", pressing(module.evaluate, signal.SIGINT, at=3))
+    monkeypatch.setattr(measure, "evaluate", pressing(measure.evaluate, signal.SIGINT, at=4))
     report = clod(EVAL, "--sv 1 2 --base BASE --popping").report
     assert report["interrupted"] is True and len(report["rows"]) == 2 and report["popping"] == []
     assert report["base_row"] and [entry["by"] for entry in report["ranked"]] == ["opacity"]

@@ -101,7 +101,7 @@ def test_prints_progress_a_table_next_commands_and_a_loss(adapted, capture):
     wanted = f"clod-adapt view dial.ply --base {base} {scene}"
     assert shlex.split(view) == shlex.split(wanted)
     assert shlex.split(measure) == shlex.split(f"clod-adapt eval dial.ply {scene} --sv 1 4")
-    assert "300 Gaussians, SH degree 1" in done.err
+    assert "Gaussians: 300, SH degree 1" in done.err
     assert "8 photographs to train on, 2 held out, 64x48" in done.err
     assert "trained 12 steps" in done.err and "\r" not in done.err
     for line in (
@@ -122,7 +122,7 @@ def test_forecast_of_time_and_memory(clod):
     """In a line before training, and with what the run took in the report."""
     done = clod("BASE --images SCENE --max-sv 2 --out dial.ply --json --iters 100")
     found = done.report["forecast"]
-    assert re.search(r"^forecast: \d+ seconds, \d.* [MG]B \(100 steps\)$", done.err, re.M)
+    assert re.search(r"^forecast: \S+ s, \d.* [MG]B \(100 steps\)$", done.err, re.M)
     assert done.err.index("\nforecast: ") < done.err.index("\ntrained 100 steps")
     assert found["steps"] == 100 and found["seconds"] > 0 and found["actual_seconds"] > 0
     assert found["bytes"] == pytest.approx(found["actual_bytes"], rel=1 / 3)
