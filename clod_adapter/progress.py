@@ -38,7 +38,7 @@ class Phase(str, Enum):
     MERGING = "merging"
     PRUNING_ORDER = "pruning order"
     TRAINING = "training"
-    NEAR_DISTANCE = "near distance"
+    FAR_REACH = "far reach"
     EVALUATION = "evaluation"
     FRAME_TIMES = "frame times"
     POPPING = "popping"

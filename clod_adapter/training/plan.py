@@ -12,8 +12,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, with_near
 from clod_adapter.progress import Listener
 from clod_adapter.training.distributed import ProcessGroup
+from clod_adapter.training.far_reach import fit_far_reach
 from clod_adapter.training.loop import Adapted, adapt
-from clod_adapter.training.near_distance import fit_near_distance
 from clod_adapter.training.pseudo_views import only_pseudo
 from clod_adapter.training.state import TrainingState
 
@@ -99,14 +99,14 @@ class Plan:
         group: ProcessGroup | None = None,
     ) -> Adapted:
         """``loop.adapt`` of ``start``; the result has the SH degrees that were left out again, and
-        without photographs the near_distance that is best at equal counts.
+        without photographs the reach of far Gaussians that is best at equal counts.
 
         The listener is given the Gaussians without them (``restore_excluded``).
         """
         adapted = adapt(self.start, scene, self.config, progress, resume, group=group)
         gaussians = adapted.gaussians
         if self.start.near is not None and not adapted.interrupted and only_pseudo(scene.train):
-            gaussians = fit_near_distance(gaussians, scene.train, progress)
+            gaussians = fit_far_reach(gaussians, scene.train, progress)
         start_seconds = adapted.start_seconds + self.seconds["start"]
         return replace(
             adapted, gaussians=self.restore_excluded(gaussians), start_seconds=start_seconds

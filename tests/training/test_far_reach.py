@@ -1,11 +1,11 @@
-"""Without photographs the distance at which far Gaussians take over follows the pictures."""
+"""Without photographs the reach of far Gaussians follows the pictures."""
 
 import pytest
 import torch
 
 from clod_adapter import make_plan
 from clod_adapter.progress import Phase
-from clod_adapter.training.near_distance import fit_near_distance
+from clod_adapter.training.far_reach import fit_far_reach
 from clod_adapter.training.pseudo_views import with_pseudo_views
 from runs import config_of
 from scenes import assert_equal, capture
@@ -26,14 +26,13 @@ def of_colour(gaussians, change):
 
 
 def test_bad_far_ones_are_put_off(started):
-    """Where far Gaussians are worse, near ones are drawn to a larger distance; nothing else
-    changes.
-    """
+    """Where far Gaussians are worse, they reach less far; nothing else changes."""
     start, views = started
     wrong = of_colour(start, lambda sh0: -sh0)
-    good, bad = (fit_near_distance(each, views) for each in (start, wrong))
-    assert bad.attenuation.near_distance > good.attenuation.near_distance
-    assert_equal(bad.replace(attenuation=start.attenuation), wrong)
+    good, bad = (fit_far_reach(each, views) for each in (start, wrong))
+    far = ~start.near
+    assert bool((bad.sigma_d[far] < good.sigma_d[far]).all())
+    assert_equal(bad.replace(sigma_d=start.sigma_d, attenuation=start.attenuation), wrong)
 
 
 def test_a_listener_ends_the_search_with_what_is_best_so_far(started):
@@ -44,8 +43,8 @@ def test_a_listener_ends_the_search_with_what_is_best_so_far(started):
         seen.append(now.phase)
         return len(seen) < 2
 
-    assert_equal(fit_near_distance(start, views, stop), start)
-    assert seen == [Phase.NEAR_DISTANCE] * 2
+    assert_equal(fit_far_reach(start, views, stop), start)
+    assert seen == [Phase.FAR_REACH] * 2
 
 
 def test_photographs_decide_nothing_of_it():
@@ -53,6 +52,6 @@ def test_photographs_decide_nothing_of_it():
     plan = make_plan(base, scene, config_of(iters=2))
     phases = set()
     adapted = plan.adapt(scene, lambda now: phases.add(now.phase))
-    assert Phase.NEAR_DISTANCE not in phases
-    trained = adapted.gaussians.attenuation.near_distance
-    assert trained == plan.start.attenuation.near_distance
+    assert Phase.FAR_REACH not in phases
+    start = plan.start.attenuation
+    assert adapted.gaussians.attenuation.reference_distance == start.reference_distance

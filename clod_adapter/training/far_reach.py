@@ -1,9 +1,9 @@
-"""The distance at which far Gaussians take over, chosen after training, by pictures at equal
-counts.
+"""The reach of far Gaussians relative to ``near_distance``, chosen after training, by pictures at
+equal counts.
 
-Where near Gaussians are dense, as in an aerial scene, a farther ``near_distance`` is better at
-every count; where they are few, a nearer one is. Before training nothing tells which: merged
-Gaussians are no measure of trained ones.
+Where near Gaussians are dense, as in an aerial scene, far ones of a shorter reach leave more of any
+count to near ones, and pictures are better; where they are few, a longer one is. Before training
+nothing tells which: merged Gaussians are no measure of trained ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from clod_adapter.render import render
 
 BUDGETS = (0.4, 0.18, 0.08, 0.04)  # shares of the near Gaussians' number, as viewers have them
 MEASURED_VIEWS = 6
-STEP = 1.15  # factor between the distances that are tried
+STEP = 1.15  # factor between the reaches that are tried
 MOST_STEPS = 8
 FARTHEST = 1e3  # end of the search for a dial value
 EXACT = 100.0  # dB, above which pictures are equal
@@ -35,12 +35,12 @@ PRECISION = 1e-3  # of the dial value that meets a budget
 
 
 @torch.no_grad()
-def fit_near_distance(
+def fit_far_reach(
     gaussians: Gaussians, views: Sequence[View], progress: Listener | None = None
 ) -> Gaussians:
-    """The Gaussians with the near_distance whose pictures differ least from those of the views.
+    """The Gaussians with the reach of far ones whose pictures differ least from those of the views.
 
-    Multiplies it by STEP, or divides, as long as that improves the mean of the PSNR over BUDGETS,
+    Divides it by STEP, or multiplies, as long as that improves the mean of the PSNR over BUDGETS,
     at equal counts, and no budget has lost more than LOSS. Budgets beyond ``max_sv`` do not count.
     Where ``progress`` returns False, the best one so far is the result.
     """
@@ -57,7 +57,7 @@ def fit_near_distance(
 
     def quality(candidate: Gaussians) -> list[float]:
         nonlocal tried
-        tell(progress, Phase.NEAR_DISTANCE, tried, 2 * MOST_STEPS)
+        tell(progress, Phase.FAR_REACH, tried, 2 * MOST_STEPS)
         tried += 1
         found = list[float]()
         for budget in budgets:
@@ -73,10 +73,10 @@ def fit_near_distance(
         return gaussians
     try:
         best = highest = quality(gaussians)
-        for factor in (STEP, 1 / STEP):
+        for factor in (1 / STEP, STEP):
             start = gaussians
             for _ in range(MOST_STEPS):
-                candidate = _with_near_distance(gaussians, factor)
+                candidate = _with_reach(gaussians, factor)
                 found = quality(candidate)
                 lost = max(high - psnr for high, psnr in zip(highest, found, strict=True))
                 if fmean(found) <= fmean(best) or lost > LOSS:
@@ -90,11 +90,15 @@ def fit_near_distance(
     return gaussians
 
 
-def _with_near_distance(gaussians: Gaussians, factor: float) -> Gaussians:
-    attenuation = gaussians.attenuation
-    assert attenuation is not None
-    near_distance = attenuation.near_distance * factor
-    return gaussians.replace(attenuation=replace(attenuation, near_distance=near_distance))
+def _with_reach(gaussians: Gaussians, factor: float) -> Gaussians:
+    """Multiplies the reach of far Gaussians, and the distance from which on they grow."""
+    attenuation, sigma_d, near = gaussians.attenuation, gaussians.sigma_d, gaussians.near
+    assert attenuation is not None and sigma_d is not None and near is not None
+    grows_from = factor * attenuation.reference_distance
+    return gaussians.replace(
+        sigma_d=torch.where(near, sigma_d, factor * sigma_d),
+        attenuation=replace(attenuation, reference_distance=grows_from),
+    )
 
 
 def _share(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> float:
