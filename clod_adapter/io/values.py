@@ -291,7 +291,9 @@ def half_turn(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations
     ``P R P``, which gives the same ellipsoids, and harmonics of an odd order change sign.
     """
-    harmonics = [(-1) ** order for degree in range(1, 4) for order in range(-degree, degree + 1)]
+    harmonics = []
+    for degree in range(1, 4):
+        harmonics += [(-1) ** order for order in range(-degree, degree + 1)]
     bands = arrays["shN"].shape[1]
     return {
         **arrays,

@@ -200,7 +200,8 @@ def read(path: Path, data: bytes) -> Source:
         return splat_transform.read(path, data)
     packed = data
     data = _unpacked(path, data)
-    magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
+    magic, version, count = struct.unpack_from("<III", data)
+    degree, bits, flags = data[12:15]
     if magic == MAGIC and version == 2:
         return splat_transform.read(path, packed)
     readable = magic == MAGIC and version == VERSION
