@@ -48,6 +48,7 @@ finfo.eps, its slope within ``2 / log m`` more.
 
 import math
 import warnings
+from collections.abc import Callable
 from functools import reduce
 from typing import NamedTuple
 
@@ -184,6 +185,20 @@ def kept_between(
         return begin, end
     first, last = (takeover_distance(config, share) for share in ((0.5, 0.5) if baked else (0, 1)))
     return torch.where(near, begin, first / d), torch.where(near, last / d, end)
+
+
+def smallest_dial(
+    fits: Callable[[float], bool], low: float, high: float, precision: float
+) -> float:
+    """The smallest dial value that ``fits``, by bisection of log s, to a relative precision.
+
+    Args:
+        low, high: values of which the first does not fit and the last does.
+    """
+    while high / low > 1 + precision:
+        middle = math.sqrt(low * high)
+        low, high = (low, middle) if fits(middle) else (middle, high)
+    return high
 
 
 def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:

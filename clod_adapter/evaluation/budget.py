@@ -23,7 +23,7 @@ from torch import Tensor
 from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, number, require
-from clod_adapter.equation.attenuation import dial, kept_between
+from clod_adapter.equation.attenuation import dial, kept_between, smallest_dial
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import time_frames
@@ -215,12 +215,8 @@ def _for_count(
                 f"{keep:,.0f} Gaussians are out of reach: {fewest / len(views):,.0f} remain at any"
                 " dial value"
             )
-    low = 1.0
-    high = largest
-    while high / low > 1 + PRECISION:
-        middle = math.sqrt(low * high)
-        low, high = (low, middle) if count(middle) <= wanted else (middle, high)
-    return DialValue(high, note)
+    found = smallest_dial(lambda s: count(s) <= wanted, 1.0, largest, PRECISION)
+    return DialValue(found, note)
 
 
 @torch.no_grad()
