@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import clod_adapter as clod
-from clod_adapter.losses import decibels
+from clod_adapter.losses import decibels, mean_squared_error
 from common import Table, append, arguments, clod_adapt, last, percent, with_best
 from tuning import TIMEOUT, find_tool
 
@@ -121,8 +121,8 @@ def measured(shown, views, budget, whole):
     for view in views:
         gaussians, s, count = shown.frame(view.camera, round(budget * whole))
         with torch.no_grad():
-            image = clod.render(gaussians, view.camera, virtual_scale=s).image.clamp(0, 1)
-        errors.append(float((image - view.image / 255).square().mean()))
+            image = clod.render(gaussians, view.camera, virtual_scale=s).image
+        errors.append(mean_squared_error(image, view.image))
         counts.append(count)
     psnr = decibels(float(np.mean(errors)))
     return {"level": f"{budget:.0%}", "share": float(np.mean(counts)) / whole, "psnr": psnr}

@@ -23,8 +23,13 @@ def psnr(image: Tensor, target: Tensor) -> float:
     ``-10 log10 mean (image - target)^2``; infinite for equal images, NaN if a pixel of the render
     is NaN.
     """
+    return decibels(mean_squared_error(image, target))
+
+
+def mean_squared_error(image: Tensor, target: Tensor) -> float:
+    """``mean (image - target)^2`` of ``psnr``."""
     difference = image.detach().clamp(0, 1) - unit(target, image)
-    return decibels(float(difference.double().square().mean()))
+    return float(difference.double().square().mean())
 
 
 def decibels(error: float) -> float:

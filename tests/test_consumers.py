@@ -25,6 +25,7 @@ from clod_adapter.initialization.importance import for_training
 from clod_adapter.integrations.splats import from_gsplat, to_gsplat
 from clod_adapter.rasterizers import BACKENDS, Rasterizer, cpu, cuda
 from clod_adapter.training.camera_placement import place_cameras
+from clod_adapter.training.far_reach import fit_far_reach
 from clod_adapter.training.pseudo_views import PseudoView, render_pseudo_views
 from clod_adapter.training.schedule import Sample
 from clod_adapter.training.trainer import Trainer
@@ -181,8 +182,15 @@ def own_loop(model):
     return [loss.detach(), *(group["params"][0].grad for group in groups)]
 
 
+def far_reach(model):
+    views = render_pseudo_views(model, CAMERAS[:1]).train
+    start = make_plan(detach(model), Scene(views, ()), CONFIG).start
+    return [fit_far_reach(start, views).sigma_d]
+
+
 RUNS = CONSUMERS | {
     "a loop of one's own": own_loop,
+    "the reach of far Gaussians": far_reach,
     "the paper's objective": papers_objective,
     "alignment": lambda model: [check_alignment(model, views_of(model)).psnr],
     "matching_dial": lambda model: [matching_dial(model, CAMERAS, 20)],

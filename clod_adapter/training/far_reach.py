@@ -8,7 +8,6 @@ nothing tells which: merged Gaussians are no measure of trained ones.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from statistics import fmean
@@ -17,10 +16,10 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import View, spread
-from clod_adapter.equation.attenuation import kept_between
+from clod_adapter.equation.attenuation import dial, kept_between, smallest_dial
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.losses import decibels
+from clod_adapter.losses import decibels, mean_squared_error
 from clod_adapter.progress import Listener, Phase, Stopped, tell
 from clod_adapter.render import render
 
@@ -28,7 +27,7 @@ BUDGETS = (0.4, 0.18, 0.08, 0.04)  # shares of the near Gaussians' number, as vi
 MEASURED_VIEWS = 6
 STEP = 1.15  # factor between the reaches that are tried
 MOST_STEPS = 8
-FARTHEST = 1e3  # end of the search for a dial value
+FARTHEST = 1e3  # dial value at which the search for one ends
 EXACT = 100.0  # dB, above which pictures are equal
 LOSS = 0.1  # dB that one budget may lose for the others
 PRECISION = 1e-3  # of the dial value that meets a budget
@@ -46,30 +45,31 @@ def fit_far_reach(
     """
     assert gaussians.attenuation is not None
     views = spread(views, MEASURED_VIEWS)
-    images = [view.image / 255 for view in views]
+    images = [view.image for view in views]
     distances = [
-        normalized_distances(gaussians.means, view.camera, gaussians.attenuation).double()
-        for view in views
+        normalized_distances(gaussians.means, view.camera, gaussians.attenuation) for view in views
     ]
-    reached = [_share(gaussians, d, gaussians.attenuation.max_sv) for d in distances]
-    budgets = [budget for budget in BUDGETS if budget >= fmean(reached)]
+    fewest = fmean(
+        int(dial(gaussians, d, gaussians.attenuation.max_sv).keep.sum()) for d in distances
+    )
+    counts = [budget * gaussians.whole for budget in BUDGETS]
+    counts = [count for count in counts if count >= fewest]
     tried = 0
 
     def quality(candidate: Gaussians) -> list[float]:
         nonlocal tried
         tell(progress, Phase.FAR_REACH, tried, 2 * MOST_STEPS)
         tried += 1
-        found = list[float]()
-        for budget in budgets:
-            errors = list[float]()
-            for view, image, d in zip(views, images, distances, strict=True):
-                s = _dial_for(candidate, d, budget)
-                pixels = render(candidate, view.camera, virtual_scale=s).image.clamp(0, 1)
-                errors.append(float((pixels - image).square().mean()))
-            found.append(min(decibels(fmean(errors)), EXACT))
-        return found
+        errors = torch.zeros(len(views), len(counts), dtype=torch.float64)
+        for i, (view, image, d) in enumerate(zip(views, images, distances, strict=True)):
+            kept = kept_between(candidate, d)
+            for k, count in enumerate(counts):
+                s = _dial_for(kept, count)
+                rendered = render(candidate, view.camera, virtual_scale=s).image
+                errors[i, k] = mean_squared_error(rendered, image)
+        return [min(decibels(error), EXACT) for error in errors.mean(0).tolist()]
 
-    if not budgets:
+    if not counts:
         return gaussians
     try:
         best = highest = quality(gaussians)
@@ -101,24 +101,13 @@ def _with_reach(gaussians: Gaussians, factor: float) -> Gaussians:
     )
 
 
-def _share(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> float:
-    """What is kept as a share of the near Gaussians' number."""
-    begin, end = kept_between(gaussians, distances)
-    return int(((begin < virtual_scale) & (virtual_scale < end)).sum()) / gaussians.whole
-
-
-def _dial_for(gaussians: Gaussians, distances: Tensor, budget: float) -> float:
-    """The smallest dial value from 1 on that keeps at most this share."""
-    begin, end = kept_between(gaussians, distances)
-    count = budget * gaussians.whole
+def _dial_for(kept: tuple[Tensor, Tensor], count: float) -> float:
+    """The smallest dial value from 1 on that keeps at most this many; ``kept`` of
+    ``kept_between``.
+    """
+    begin, end = kept
 
     def fits(s: float) -> bool:
         return int(((begin < s) & (s < end)).sum()) <= count
 
-    low = high = 1.0
-    while not fits(high) and high < FARTHEST:
-        low, high = high, 2 * high
-    while high / low > 1 + PRECISION:
-        middle = math.sqrt(low * high)
-        low, high = (low, middle) if fits(middle) else (middle, high)
-    return high
+    return 1.0 if fits(1.0) else smallest_dial(fits, 1.0, FARTHEST, PRECISION)
