@@ -3,10 +3,11 @@ change at a time.
 
     python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full
     python benchmarks/choices.py demo --names SHARE full    # the folder of clod-adapt demo
+    python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER    # no photographs
 
-A scene is a folder of the shared data, or one of the demo. Each run adds one row to
-``results/choices.jsonl``; "default" changes nothing. A choice is a constant of ``training/far.py``,
-a field of ``schedule.FAR``, or a field of ``AdaptConfig``.
+A scene is a folder of the shared data, one of the demo, or a file, whose placed cameras and renders
+are used. Each run adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice is
+a constant of ``training/far.py``, a field of ``schedule.FAR``, or a field of ``AdaptConfig``.
 """
 
 from contextlib import nullcontext
@@ -19,6 +20,7 @@ from unittest.mock import patch
 import clod_adapter as clod
 from adapt import adapted
 from clod_adapter.training import dial, far
+from clod_adapter.training.pseudo_views import with_pseudo_views
 from clod_adapter.training.schedule import FAR
 from common import (
     Table,
@@ -31,11 +33,15 @@ from common import (
     psnr_at,
     psnr_kept,
 )
+from stream import rendered
 
 FILE, MAX_SV = "choices.jsonl", 7.0  # of captures, as adapt.jsonl has them
 ALTERNATIVES: dict[str, tuple[Any, ...]] = {
     "SHARE": (0.4, 0.6),
     "NEARER": (0.3, 0.5),
+    "PLACED_SHARE": (0.8,),
+    "PLACED_NEARER": (0.2, 0.5),
+    "PLACED_CONTRAST": (1.0,),
     "LONGER": (1.0,),
     "full": (0.0, 0.5),
     "coarse": (0.0, 0.9),
@@ -83,12 +89,17 @@ def opened(scene):
     demo = Path(scene) / "base.ply"
     if demo.exists():
         return clod.load(demo).gaussians, clod.load_scene(demo.with_name("capture"))
-    return checkpoint(scene).gaussians, photographs(scene)
+    if not scene.endswith(".ply"):
+        return checkpoint(scene).gaussians, photographs(scene)
+    base = clod.load(scene).gaussians
+    return base, clod.Scene(with_pseudo_views(base, None).train, tuple(rendered(base)))
 
 
 def measure(scene, base, views, name, value):
     """Adapts with one change, and adds the row."""
     make = partial(clod.AdaptConfig, max_sv=MAX_SV)
+    if scene.endswith(".ply"):
+        make = partial(clod.AdaptConfig.placed)
     change = nullcontext()
     if hasattr(far, name):
         change = patch.object(far, name, value)

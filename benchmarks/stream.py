@@ -3,9 +3,10 @@ budgets.
 
     python benchmarks/stream.py SCENE.ply --record    # without photographs
     python benchmarks/stream.py SCENE.ply --images FOLDER --record    # with photographs
+    python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record    # its author's, too
 
-SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself, halved
-again and again by splat-transform (``make peers``) in both its ways.
+SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
+again and again by splat-transform (``make peers``) in both its ways, and the author's own.
 ``export --lod-meta`` of the adapted file is drawn too. A set is drawn by the rule of PlayCanvas
 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is that of the
 nearest point of its box; level b >= 1 begins at K multiplier^(b - 1); in each frame one K for all
@@ -46,6 +47,7 @@ SHOWN = {
     "lod-meta": "this file's levels, `export --lod-meta`",
     "halved": "halved uniformly",
     "halved adaptively": "halved adaptively",
+    "author": "its author's levels",
 }
 Files = dict[float, list[Path]]
 
@@ -54,6 +56,8 @@ def main():
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--images", type=Path, help="photographs; without it there are none")
+    text = "its author's coarser levels, the finest first"
+    parser.add_argument("--author", nargs="+", type=Path, default=[], help=text)
     args = parser.parse_args()
     base = clod.load(args.scene).gaussians
     views = clod.load_scene(args.images).test if args.images else rendered(base)
@@ -67,7 +71,7 @@ def main():
         append(FILE, {"scene": scene, **row}, args.record)
         for row in of_dial(base, out, views):
             append(FILE, {"scene": scene, **row}, args.record)
-        for row in of_sets(base, sets_of(args.scene, out, folder), views):
+        for row in of_sets(base, sets_of(args.scene, args.author, out, folder), views):
             append(FILE, {"scene": scene, **row}, args.record)
 
 
@@ -82,11 +86,13 @@ def of_dial(base, adapted, views):
         yield {"method": "dial", **measured(Dial(dial), views, budget, len(base))}
 
 
-def sets_of(scene, adapted, folder):
+def sets_of(scene, author, adapted, folder):
     """The levels of each set for each multiplier, the finest first."""
     sets = {}
     for name, option in SETS.items():
         sets[name] = dict.fromkeys(MULTIPLIERS, [scene, *halved(scene, option, folder / name)])
+    if author:
+        sets["author"] = dict.fromkeys(MULTIPLIERS, [scene, *author])
     sets["lod-meta"] = {
         each: own_levels(adapted, each, folder / f"own{each:g}") for each in MULTIPLIERS
     }
