@@ -39,6 +39,7 @@ SCENES = {  # of the tables
     "taebak4": "an aerial scene of 212,464",
     "garden2": "a garden of 843,068 by another author",
     "showroom3": "a showroom of 747,000 by that author",
+    "playbot": "a robot of 500,000, SH degree 2 (PLAYBOT by Stephane Agullo, CC BY 4.0)",
     "plush_half": "a plush toy, 120,000, photographs",
     "bonsai146": "a table in a room, 150,000, photographs",
 }
