@@ -8,7 +8,8 @@
 - ``prefix``: one file whose prefixes are the counts, by removal error, tuned with random prefixes
   (``tuning.tune``);
 - ``ranking``: prefixes by removal error without tuning;
-- ``kept``: no rival, but what ``export --keep`` writes of one adapted file, a plain file per count.
+- ``kept``: no rival, but what ``export --keep`` writes of one adapted file, a plain file per count,
+  without and with ``--tune``.
 
 A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl``.
 """
@@ -42,6 +43,7 @@ RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking", "kept")
 MAX_SV = 20  # of the adapted file
 SHOWN = {  # in the table, by rival and end of the label
     ("kept", ""): "exported from it, a plain file each",
+    ("kept", "--tune"): "exported and tuned",
     ("specialist", ""): "specialist, a file each",
     ("prefix", ""): "prefixes, one file",
     ("merging", "--decimate"): "merging, uniform",
@@ -109,7 +111,13 @@ def contest(rival, base, folder, views, iters):
         files = {1.0: tuned} | prefixes(tuned, counts)
         yield "prefixes by removal error, lengths log", files, about | {"train_seconds": seconds}
     elif rival == "kept":
-        yield f"export --keep of one file, max_sv {MAX_SV}", kept(base, folder, counts), {}
+        with tempfile.TemporaryDirectory() as place:
+            dial = Path(place) / "dial.ply"
+            settings = ("--max-sv", MAX_SV, "--quiet")
+            clod_adapt(base.path, "--images", folder, *settings, "--out", dial)
+            label = f"export --keep of one file, max_sv {MAX_SV}"
+            yield label, kept(dial, counts), {}
+            yield f"{label} --tune", kept(dial, counts, "--tune", "--images", folder), {}
     else:
         ranked = by_importance(gaussians, train)
         yield "untouched, by removal error", prefixes(ranked, counts), {}
@@ -119,16 +127,13 @@ def prefixes(gaussians, counts):
     return {share: gaussians[:count] for share, count in counts.items()}
 
 
-def kept(base, folder, counts):
-    """By share, the plain file that ``export --keep`` writes after the default command."""
-    with tempfile.TemporaryDirectory() as place:
-        dial, plain = Path(place) / "dial.ply", Path(place) / "plain.ply"
-        settings = ("--max-sv", MAX_SV, "--quiet")
-        clod_adapt(base.path, "--images", folder, *settings, "--out", dial)
-        files = {}
-        for share, count in counts.items():
-            clod_adapt("export", dial, "--keep", count, "--out", plain)
-            files[share] = clod.load(plain).gaussians
+def kept(dial, counts, *options):
+    """By share, the plain file that ``export --keep`` writes of a file with a dial."""
+    files = {}
+    for share, count in counts.items():
+        plain = dial.with_suffix(f".{count}.ply")
+        clod_adapt("export", dial, "--keep", count, *options, "--quiet", "--out", plain)
+        files[share] = clod.load(plain).gaussians
     return files
 
 
@@ -141,7 +146,8 @@ def page_table(scene):
     rows = {}
     for row in stored(FILE):
         if row["scene"] == scene:
-            way = row["label"].split()[-1] if row["rival"] == "merging" else ""
+            way = row["label"].split()[-1]
+            way = way if way.startswith("--") else ""
             label = SHOWN[row["rival"], way]
             for point in row["rows"]:
                 found[label][point["share"]] = point["psnr"]

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from clod_adapter.training.plan import Decision, Override, Plan
     from clod_adapter.training.planner import make_plan
     from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
+    from clod_adapter.training.tuning import tune, tune_levels
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its
 # errors do without.
@@ -71,6 +72,7 @@ _names = {
     "training.plan": "Decision Override Plan",
     "training.planner": "make_plan",
     "training.pseudo_views": "add_pseudo_views render_pseudo_views",
+    "training.tuning": "tune tune_levels",
 }
 _homes = dict[str, str]()
 for _home in _names:
@@ -143,5 +145,7 @@ __all__ = [
     "save",
     "save_adapter",
     "to_gsplat",
+    "tune",
+    "tune_levels",
     "with_dial",
 ]

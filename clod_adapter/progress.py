@@ -39,6 +39,7 @@ class Phase(str, Enum):
     PRUNING_ORDER = "pruning order"
     TRAINING = "training"
     FAR_REACH = "far reach"
+    TUNING = "tuning"
     EVALUATION = "evaluation"
     FRAME_TIMES = "frame times"
     POPPING = "popping"

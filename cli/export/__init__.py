@@ -66,6 +66,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     output.add_argument("--multiplier", metavar="M", type=float, default=MULTIPLIER, help=text)
     text = "fit the view-dependent colours to this SH degree, 0 to 3: most of a file's bytes"
     output.add_argument("--sh-degree", metavar="N", type=int, choices=range(4), help=text)
+    text = (
+        "fine-tune what is baked for a dial value, or each level for its band, on the photographs"
+        " of --images; of a MODEL adapted without any, on its renders at s = 0"
+    )
+    output.add_argument("--tune", action="store_true", help=text)
     output.add_argument(
         "--order", choices=["extinction"], help="put first the Gaussians that are culled last"
     )
@@ -74,7 +79,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         action="store_true",
         help="an .html page with float32 values: eight times the size",
     )
-    common.add_device(output, "time frames for --fps with --images")
+    common.add_device(output, "tune, or time frames for --fps with --images,")
 
 
 def check(args: Namespace) -> None:
@@ -114,15 +119,22 @@ def check(args: Namespace) -> None:
             "--camera needs a dial value to bake; give one, as in --sv 2",
         ),
         (
+            args.tune and (page or args.camera is not None or not (bakes or folder)),
+            (
+                "--tune is for dial values that are baked for all cameras, and for levels: add"
+                f" --keep N, or one of {' and '.join(FOLDERS)}; remove --camera"
+            ),
+        ),
+        (
             args.exact and not page,
             f"--exact is for {PAGE} pages; another format has its own precision: remove it",
         ),
         (
             args.images is not None
-            and not (bakes or args.order or page or args.sh_degree is not None),
+            and not (bakes or args.order or page or args.sh_degree is not None or args.tune),
             (
-                f"--images is used for baking, --sh-degree, --order and {PAGE} only; add one of"
-                " them, as in --sv 2"
+                f"--images is used for baking, --tune, --sh-degree, --order and {PAGE} only; add"
+                " one of them, as in --sv 2"
             ),
         ),
         (
@@ -224,6 +236,10 @@ levels and order:
   of the Gaussians. Viewers draw each part of a scene at the level of its band.
   --order extinction is for renderers that draw the first n rows: for any n
   these are the rows of --keep n. They pop where the dial fades.
+
+tuning:
+  --tune takes minutes for each file. A file of one dial value gains a little,
+  one beyond the trained range several dB. MODEL itself stays as it is.
 
 SH degree:
   --sh-degree 1 saves 144 of 248 bytes for each Gaussian of degree 3 in a .ply.

@@ -11,11 +11,17 @@ from clod_adapter import (
     Camera,
     ClodError,
     Gaussians,
+    Phase,
+    View,
     bake,
     bake_levels,
+    detach,
     order_by_extinction,
     place_cameras,
     render,
+    render_pseudo_views,
+    tune,
+    tune_levels,
 )
 from clod_adapter.bake import Level
 from clod_adapter.calibration import Viewpoint
@@ -109,9 +115,10 @@ class Export:
 
     def __init__(self, args: Namespace) -> None:
         self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
-        times = args.images is not None and args.fps
-        device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
+        renders = args.tune or (args.images is not None and args.fps)
+        device = inputs.pick_device(args.device, self.console) if renders else inputs.CPU
         self.model = inputs.read_model(args, args.model, self.console, device=device)
+        self.tuning_views = self._find_tuning_views() if args.tune else ()
         self.others = [
             inputs.read_model(args, path, self.console, self.model.origin, device)
             for path in args.others
@@ -136,6 +143,19 @@ class Export:
         elif dials:
             dials = choose_dials(dials, self.model, self.console)
         self.dials: list[float] = dials or []  # which are baked, or the one at which a page opens
+
+    def _find_tuning_views(self) -> Sequence[View]:
+        """The photographs of --images; renders at s = 0 of a model that was adapted without any."""
+        model = self.model
+        if self.args.images is None and not model.placed:
+            raise ClodError(
+                f"{model.path}: --tune needs the photographs that it was adapted on; give --images"
+            )
+        inputs.prepare_kernels(self.console, model.gaussians.means.device)
+        if self.args.images is None:
+            return render_pseudo_views(detach(model.gaussians), model.cameras).train
+        scene = inputs.read_scene(self.args.images, self.console, model.origin)
+        return inputs.align_shown(model, scene, self.console, required=False)[0].train
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they
@@ -268,6 +288,10 @@ class Export:
             gaussians = bake(
                 gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras
             )
+            if self.args.tune:
+                about.append("tuned for this dial value")
+                with self.console.meter(Phase.TUNING) as meter:
+                    gaussians = tune(gaussians, self.tuning_views, progress=meter)
         about += (
             ["rows in the order in which the dial keeps them longest"] if self.args.order else []
         )
@@ -300,6 +324,9 @@ class Export:
     def _write_set(self, index: Path) -> list[Level]:
         """Writes a streaming or 3D Tiles set to the folder of ``index``; its levels."""
         levels = bake_levels(self.gaussians, self.args.multiplier)
+        if self.args.tune:
+            with self.console.meter(Phase.TUNING) as meter:
+                levels = tune_levels(levels, self.tuning_views, progress=meter)
         if self.args.folder == "--3dtiles":
             self.console.note(*write_tileset(index.parent, levels, origin=self.model.origin))
             return levels

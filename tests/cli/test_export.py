@@ -19,6 +19,7 @@ from clod_adapter import (
     bake,
     bake_levels,
     detach,
+    evaluate,
     load,
     load_scene,
     order_by_extinction,
@@ -151,6 +152,19 @@ def test_sets_have_a_level_for_each_band_of_distances(clod, attenuated, tmp_path
         assert len(level.gaussians) == counts[k]
     root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
     assert root["geometricError"] > root["children"][0]["geometricError"] >= 0
+
+
+def test_tuned_files_show_the_photographs_better(clod, capture, attenuated):
+    scene = load_scene(capture.scene)
+    errors = []
+    for option in ("", "--tune"):
+        clod(EXPORT, "--keep 60 --images SCENE -o x.ply", option)
+        plain = load("x.ply")
+        assert len(plain.gaussians) == 60
+        rows = evaluate(plain.gaussians, scene.train, [1.0])
+        errors.append(rows[0].psnr)
+    assert errors[1] > errors[0] + 1
+    assert any("tuned" in comment for comment in plain.comments)
 
 
 def test_a_lower_sh_degree_is_fitted(clod, capture):
