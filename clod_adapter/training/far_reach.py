@@ -22,9 +22,10 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import decibels, mean_squared_error
 from clod_adapter.progress import Listener, Phase, Stopped, tell
 from clod_adapter.render import render
+from clod_adapter.training.schedule import FAR
 
 BUDGETS = (0.4, 0.18, 0.08, 0.04)  # shares of the near Gaussians' number, as viewers have them
-MEASURED_VIEWS = 6
+MEASURED_VIEWS = 24  # few are all easy, or all hard: at 8 % views differ by 10 dB
 STEP = 1.15  # factor between the reaches that are tried
 MOST_STEPS = 8
 FARTHEST = 1e3  # dial value at which the search for one ends
@@ -40,7 +41,8 @@ def fit_far_reach(
     """The Gaussians with the reach of far ones whose pictures differ least from those of the views.
 
     Divides it by STEP, or multiplies, as long as that improves the mean of the PSNR over BUDGETS,
-    at equal counts, and no budget has lost more than LOSS. Budgets beyond ``max_sv`` do not count.
+    at equal counts, and no budget has lost more than LOSS. Budgets beyond the dial values that were
+    counted in training do not matter.
     Where ``progress`` returns False, the best one so far is the result.
     """
     assert gaussians.attenuation is not None
@@ -49,9 +51,8 @@ def fit_far_reach(
     distances = [
         normalized_distances(gaussians.means, view.camera, gaussians.attenuation) for view in views
     ]
-    fewest = fmean(
-        int(dial(gaussians, d, gaussians.attenuation.max_sv).keep.sum()) for d in distances
-    )
+    farthest = FAR.counted * gaussians.attenuation.max_sv
+    fewest = fmean(int(dial(gaussians, d, farthest).keep.sum()) for d in distances)
     counts = [budget * gaussians.whole for budget in BUDGETS]
     counts = [count for count in counts if count >= fewest]
     tried = 0
