@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -154,9 +153,11 @@ class _Tuning:
             name: torch.cat([mean, self.parameters[name][self.trained :]])
             for name, mean in self.mean.items()
         }
-        split = {name: value.split(self.counts) for name, value in result.items()}
-        tuned: list[Any] = [
-            level._replace(gaussians=level.gaussians.replace(**{n: v[k] for n, v in split.items()}))
-            for k, level in enumerate(reversed(self.given))
-        ]
-        return tuned[::-1]
+        tuned = list[Level]()
+        end = sum(self.counts)
+        for level in self.given:
+            rows = slice(end - len(level.gaussians), end)
+            changed = {name: value[rows].clone() for name, value in result.items()}
+            tuned.append(Level(level.begins, level.gaussians.replace(**changed)))
+            end = rows.start
+        return tuned
