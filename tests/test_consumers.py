@@ -29,6 +29,7 @@ from clod_adapter.training.far_reach import fit_far_reach
 from clod_adapter.training.pseudo_views import PseudoView, render_pseudo_views
 from clod_adapter.training.schedule import Sample
 from clod_adapter.training.trainer import Trainer
+from clod_adapter.training.tuning import tune
 from fake_gpu import fake_gpu, waits
 from scenes import gaussians, photograph, ring, seeded
 
@@ -195,6 +196,7 @@ RUNS = CONSUMERS | {
     "alignment": lambda model: [check_alignment(model, views_of(model)).psnr],
     "matching_dial": lambda model: [matching_dial(model, CAMERAS, 20)],
     "placed cameras": lambda model: [place_cameras(model, views=1)[0].viewmat.numpy()],
+    "tuning": lambda model: [tune(detach(model), views_of(model), 2).sh0],
     "pseudo views": lambda model: [render_pseudo_views(model, CAMERAS[:1]).train[0].image.numpy()],
 }
 

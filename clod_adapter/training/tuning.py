@@ -126,7 +126,8 @@ class _Tuning:
         """Tunes the rows that are drawn in the next view."""
         view = self.sampler.draw(0, share_done).view
         s = self.farthest ** self.sampler.random.random()
-        distances = s * (self.parameters["means"] - view.camera.position.float()).norm(dim=1)
+        means = self.parameters["means"]
+        distances = s * (means - view.camera.position.to(means)).norm(dim=1)
         drawn = (self.begin <= distances) & (distances < self.end)
         rows = drawn.nonzero()[:, 0]
         leaves = {
