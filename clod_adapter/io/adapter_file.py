@@ -7,13 +7,12 @@ attributes have names that begin with ``far.``. The JSON is stored under the met
 """
 
 from pathlib import Path
-from typing import Any
 
 from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import KEY, read_bytes
+from clod_adapter.io.file_formats import KEY, START, read_bytes, reject_known
 from clod_adapter.io.settings import (
     ADAPTER,
     DAMAGED,
@@ -22,7 +21,7 @@ from clod_adapter.io.settings import (
     parse_document,
     read_metadata,
 )
-from clod_adapter.io.tensor_file import parse_tensors, read_tensor_header, write_tensors
+from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
 ADDED = "far."
 
@@ -52,7 +51,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         ) from error
     with atomic_path(path) as temporary:
         write_tensors(temporary, tensors, {KEY: text})
-        _description(temporary, read_tensor_header(temporary)[1])  # it can be read again
+        load_adapter(temporary)  # it can be read again
 
 
 def load_adapter(path: str | Path) -> Adapter:
@@ -62,8 +61,19 @@ def load_adapter(path: str | Path) -> Adapter:
         ClodError: the file cannot be read, is damaged, not an adapter, or of a newer format.
     """
     path = Path(path)
-    tensors, metadata = parse_tensors(path, read_bytes(path))
-    about, settings = _description(path, metadata)
+    reject_known(path, read_bytes(path, START))
+    with rejected_if_damaged(path, "is not a safetensors file, or damaged"):
+        tensors, metadata = read_tensors(path)
+    if KEY not in metadata:
+        raise ClodError(
+            f"{path}: is a safetensors file but not an adapter; give a file that this package wrote"
+        )
+    about = parse_document(path, metadata[KEY], ADAPTER)
+    with rejected_if_damaged(path, *DAMAGED):
+        for name, kind in (("base_sha256", str), ("config", dict)):
+            if not isinstance(about[name], kind):
+                raise TypeError(f"{name} is {about[name]!r:.40}, not a {kind.__name__}")
+    settings = read_metadata(path, about, dial=True)
     assert settings.attenuation is not None
     with rejected_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
         names = [name for name in tensors if name.startswith(ADDED)]
@@ -82,17 +92,3 @@ def load_adapter(path: str | Path) -> Adapter:
             screen_filter=settings.screen_filter or CLASSIC,
             notes=settings.notes,
         )
-
-
-def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], Metadata]:
-    """The JSON document of an adapter, and the settings in it; rejects another file."""
-    if KEY not in metadata:
-        raise ClodError(
-            f"{path}: is a safetensors file but not an adapter; give a file that this package wrote"
-        )
-    about = parse_document(path, metadata[KEY], ADAPTER)
-    with rejected_if_damaged(path, *DAMAGED):
-        for name, kind in (("base_sha256", str), ("package_version", str), ("config", dict)):
-            if not isinstance(about[name], kind):
-                raise TypeError(f"{name} is {about[name]!r:.40}, not a {kind.__name__}")
-    return about, read_metadata(path, about, dial=True)

@@ -3,21 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping
-from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safetensors import safe_open
-
-from clod_adapter.errors import rejected_if_damaged
-from clod_adapter.io.file_formats import START, read_bytes, reject_known
-
 if TYPE_CHECKING:
     from torch import Tensor
-
-_DAMAGED = "is not a safetensors file, or damaged", "copy or export it again"
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
@@ -35,9 +26,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     for name in names:
         array = arrays[name]
         end = at + array.nbytes
-        kind = (
-            "BOOL" if array.dtype.kind == "b" else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
-        )
+        kind = "BOOL" if array.dtype == bool else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
         header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [at, end]}
         at = end
     head = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
@@ -50,35 +39,8 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors and the metadata of a file; for ``rejected_if_damaged``."""
-    with open(path, "rb") as file, safe_open(_name_of(file), framework="pt") as tensors:
-        # Copies, since the file may change under a memory map.
-        names = tensors.keys()
-        copies = {name: tensors.get_tensor(name).clone() for name in names}
-        return copies, tensors.metadata() or {}
+    from safetensors.torch import load
 
-
-def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the metadata of an input file with these bytes."""
-    from safetensors.torch import load  # here: a header is read without torch
-
-    reject_known(path, data[:START])
-    with rejected_if_damaged(path, *_DAMAGED):
-        tensors = load(data)
-        head = data[8 : 8 + int.from_bytes(data[:8], "little")]
-        return tensors, json.loads(head).get("__metadata__", {})
-
-
-def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
-    """The names of the tensors and the metadata, without torch."""
-    reject_known(path, read_bytes(path, START))
-    with (
-        rejected_if_damaged(path, *_DAMAGED),
-        open(path, "rb") as file,
-        safe_open(_name_of(file), framework="np") as tensors,
-    ):
-        return list(tensors.keys()), tensors.metadata() or {}
-
-
-def _name_of(file: BufferedReader) -> str:
-    """A name of an open file, in UTF-8 as safetensors takes it."""
-    return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
+    data = path.read_bytes()  # not mapped: the file may change meanwhile
+    head = data[8 : 8 + int.from_bytes(data[:8], "little")]
+    return load(data), json.loads(head).get("__metadata__", {})

@@ -25,7 +25,7 @@ from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.settings import Metadata
-from clod_adapter.io.tensor_file import read_tensor_header
+from clod_adapter.io.tensor_file import read_tensors
 from formats import (
     ATTENUATION,
     CALIBRATION,
@@ -142,7 +142,7 @@ def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path, old, new):
 
 def with_a_cut(path):
     """A safetensors file whose JSON has a setting of the earlier form."""
-    about = json.loads(read_tensor_header(written(path))[1]["clod_adapter"])
+    about = json.loads(read_tensors(written(path))[1]["clod_adapter"])
     about["attenuation"]["cut"] = "soft"
     save_file(load_file(path), path, {"clod_adapter": json.dumps(about)})
     return path
