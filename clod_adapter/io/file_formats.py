@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.ranks import check_ranks, joined, ranks_of
 from clod_adapter.io.settings import Metadata, Source
 
 if TYPE_CHECKING:
@@ -28,10 +29,8 @@ Writer = Callable[..., tuple[str, ...]]
 
 class Format(NamedTuple):
     """A format. Its module has ``read``, of a path and the bytes of the file to a ``Source``
-    without their hash.
-
-    If it carries sigma_d also ``has_dial``, of a file that was checked; if it is written also
-    ``write``, of a path, Gaussians in world units and their ``Metadata``, to a line for each loss.
+    without their hash; if it is written also ``write``, of a path, Gaussians in world units and
+    their ``Metadata``, to a line for each loss.
     """
 
     module: str = ""  # under ``clod_adapter.io``, imported when it is used
@@ -81,10 +80,14 @@ def check_readable(path: Path) -> None:
 
 
 def file_has_dial(path: Path) -> bool:
-    """Whether the file has a sigma_d, by its header (an .spz is read)."""
-    check_readable(path)
+    """Whether the file has a sigma_d: of a PLY by its header, other formats are read."""
     form = format_of(path)
-    return form.carries_sigma and bool(_call(f"{form.module}.has_dial", path))
+    if form is PLY:
+        return bool(_call("ply.has_dial", path))
+    if form.carries_sigma:
+        return read_source(path).metadata.attenuation is not None
+    check_readable(path)
+    return False
 
 
 def check_suffix(path: Path) -> None:
@@ -100,19 +103,6 @@ def check_suffix(path: Path) -> None:
         )
 
 
-def check_written(path: Path) -> None:
-    """Rejects a file just written that could not be read again: a PLY by its header and length,
-    others read whole.
-    """
-    try:
-        (file_has_dial if format_of(path) is PLY else read_source)(path)
-    except ClodError as error:
-        reason = str(error).removeprefix(f"{path}: ")
-        raise ClodError(
-            f"{path}: is not written, because it could not be read again: {reason}"
-        ) from error
-
-
 def read_source(path: Path) -> Source:
     """The content of a file in any format, with the other ranks of a checkpoint of several GPUs
     (``ranks``).
@@ -120,14 +110,12 @@ def read_source(path: Path) -> Source:
     Every reader rejects, in one line, what is damaged or of another kind.
     """
     source = _read(path)
-    ranks: dict[int, Path] = {} if source.metadata.described else _call("ranks.ranks_of", path)
-    if ranks:
-        _call("ranks.check_ranks", path, ranks)
-    if len(ranks) < 2:
+    ranks = {} if source.metadata.described else ranks_of(path)
+    if not ranks:
         return source
+    check_ranks(path, ranks)
     sources = [source if rank == path else _read(rank) for rank in ranks.values()]
-    joined: Source = _call("ranks.joined", path, sources)
-    return joined
+    return joined(path, sources) if len(sources) > 1 else source
 
 
 def _read(path: Path) -> Source:
@@ -165,7 +153,12 @@ def write(
     writer = writer or partial(_call, f"{form.module}.write")
     with atomic_path(path) as temporary:
         notes = writer(temporary, g, stored)
-        check_written(temporary)
+        try:
+            file_has_dial(temporary)
+        except ClodError as error:
+            raise ClodError(
+                f"{path}: is not written, because it could not be read again: {error}"
+            ) from error
     return notes
 
 
@@ -237,8 +230,7 @@ OTHERS: dict[str | bytes, tuple[str, str]] = {
     ),
     b"glTF": ("a glTF model", "call it .glb"),
     b"NGSP": ("an SPZ file", "call it .spz"),
-    b"ply\n": ("a PLY file", "call it .ply"),
-    b"ply\r": ("a PLY file", "call it .ply"),
+    b"ply": ("a PLY file", "call it .ply"),
 }
 
 

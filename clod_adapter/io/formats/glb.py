@@ -173,14 +173,6 @@ def write_points(
         file.write(bytes(padded - size))
 
 
-def has_dial(path: Path) -> bool:
-    """Whether the primitive has a sigma_d; the file is mapped, and its values are not read."""
-    with rejected_if_damaged(path, *_DAMAGED):
-        gltf, _ = _chunks(path, np.memmap(path, np.uint8, "r").data)
-        (_, primitive), *_ = _find(path, gltf)
-        return DIAL_ATTRIBUTES[SIGMA] in primitive["attributes"]
-
-
 def read(path: Path, data: bytes) -> Source:
     """Reads the first primitive with the extension, into the axes of checkpoints: y down.
 

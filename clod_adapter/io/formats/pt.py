@@ -82,13 +82,6 @@ def check(path: Path) -> None:
                     )
 
 
-def has_dial(path: Path) -> bool:
-    """Whether the pickle, which is not unpickled, names a sigma_d."""
-    with zipfile.ZipFile(path) as archive:
-        (name,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
-        return any(argument == SIGMA for _, argument, _ in pickletools.genops(archive.read(name)))
-
-
 def read(path: Path, data: bytes) -> Source:
     """Reads a checkpoint of gsplat's trainer, or one written here; with ``weights_only``, so that
     no code runs.

@@ -39,7 +39,7 @@ from clod_adapter.equation.units import (
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
-from clod_adapter.io.file_formats import NEW_SPZ, START, read_bytes
+from clod_adapter.io.file_formats import NEW_SPZ
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import DAMAGED, MODEL, TAG, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, bytes_of, dial_columns
@@ -185,13 +185,6 @@ def _losses(arrays: dict[str, np.ndarray], bits: int) -> list[str]:
     if (np.abs(arrays["log_scales"] + 2.03125) > 8).any():
         notes.append("scales beyond e^-10 to e^5.9 are cut to it")
     return notes
-
-
-def has_dial(path: Path) -> bool:
-    """Whether the file has a sigma_d; all of it is read, which is never much."""
-    if read_bytes(path, START).startswith(NEW_SPZ):
-        return False
-    return SIGMA in read(path, read_bytes(path)).arrays
 
 
 def read(path: Path, data: bytes) -> Source:
