@@ -31,10 +31,6 @@ from clod_adapter.origin import NOWHERE, Origin, origin_of
 EXTENSION = "KHR_gaussian_splatting"
 DIAL_ATTRIBUTES = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D", OPACITY: "_OPACITY_D"}
 COLOR_SPACE = "srgb_rec709_display"
-DEGREE = 3  # the highest that the extension has
-# about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
-HALF_TURN = [0.0, 0.0, 1.0, 0.0]
-_LIMIT = 1 << 32  # bytes of a file, whose header says how many in 32 bits
 _FLOAT = 5126
 _BYTE = 5121
 
@@ -63,8 +59,6 @@ _ATTRIBUTES = {
     "sh0": (harmonics(0)[0], 3),
 }
 _REMEDY = "export it again, as a .ply"
-_DAMAGED = "is damaged or no such .glb", _REMEDY
-IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 # a program that wrote SCALE so, whatever its range
 _LOGARITHMS = r"splat-transform 2\.([0-2]\.\d+|3\.[01])"
@@ -77,21 +71,21 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     arrays = arrays_of(path, gaussians)
     sh0 = arrays["sh0"].reshape(-1, 3)
     opacities = values.sigmoid(arrays["opacity_logits"]).astype(np.float32)
-    columns: dict[str, np.ndarray] = {
+    columns = {
         "POSITION": arrays["means"],
         "COLOR_0": values.colours_of(sh0, opacities),
-        f"{EXTENSION}:ROTATION": np.ascontiguousarray(
-            np.roll(values.normalized(arrays["quats"]), -1, axis=1)
-        ),
+        f"{EXTENSION}:ROTATION": np.roll(values.normalized(arrays["quats"]), -1, axis=1),
         f"{EXTENSION}:SCALE": values.scales_of(path, arrays["log_scales"]),
         f"{EXTENSION}:OPACITY": opacities,
-        harmonics(0)[0]: sh0,
     }
-    for k, name in enumerate(harmonics(gaussians.sh_degree)[1:]):
-        columns[name] = np.ascontiguousarray(arrays["shN"][:, k])
+    first, *higher = harmonics(gaussians.sh_degree)
+    columns[first] = sh0
+    for k, name in enumerate(higher):
+        columns[name] = arrays["shN"][:, k]
     columns |= {DIAL_ATTRIBUTES[name]: arrays[name] for name in dial_columns(arrays)}
     accessors: dict[str, dict[str, Any]] = {}
     views: list[dict[str, Any]] = []
+    buffers = []
     offset = 0
     for name, array in columns.items():
         kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
@@ -99,13 +93,14 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         views.append(
             {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": 34962}
         )
+        buffers.append(np.ascontiguousarray(array).data)
         offset += array.nbytes
-    node = {"rotation": HALF_TURN}
+    # a half turn about z: x right, y down becomes x left, y up; as splat-transform has it
+    node = {"rotation": [0.0, 0.0, 1.0, 0.0]}
     if any(metadata.origin):
         x, y, z = metadata.origin
         node["translation"] = [0.0 - x, 0.0 - y, z]
     extras = {KEY: json.loads(document(MODEL, metadata))}
-    buffers = [array.data for array in columns.values()]
     write_points(path, gaussians.means, accessors, node, views, buffers, extras=extras)
     return ()
 
@@ -135,21 +130,15 @@ def write_points(
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }
-    extensions_used = [EXTENSION]
-    required = {}
-    if extensions:
-        splats["extensions"] = extensions
-        extensions_used += extensions
-        required = {"extensionsRequired": extensions_used}
     attributes = {name: index for index, name in enumerate(accessors)}
     size = sum(memoryview(buffer).nbytes for buffer in buffers)
-    if size >= _LIMIT - (1 << 20):
+    if size >= (1 << 32) - (1 << 20):  # the header has the size of all in 32 bits
         raise ClodError(
             f"{path}: {size:,} bytes are more than a .glb can hold; keep fewer Gaussians or write a"
             " .ply"
         )
     primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: splats}}
-    gltf = {
+    gltf: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": f"clod-adapter {package_version()}", **asset},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
@@ -158,9 +147,11 @@ def write_points(
         "accessors": list(accessors.values()),
         "buffers": [{"byteLength": size}],
         "bufferViews": views,
-        "extensionsUsed": extensions_used,
-        **required,
+        "extensionsUsed": [EXTENSION],
     }
+    if extensions:
+        splats["extensions"] = extensions
+        gltf["extensionsUsed"] = gltf["extensionsRequired"] = [EXTENSION, *extensions]
     text = json.dumps(gltf, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     padded = size + -size % 4
@@ -179,26 +170,27 @@ def read(path: Path, data: bytes) -> Source:
     Under a node without a rotation the values are in glTF's own axes, and are turned here; files of
     this package have the half turn in the node and store the checkpoint's values.
     """
-    with rejected_if_damaged(path, *_DAMAGED):
-        gltf, binary = _chunks(path, memoryview(data))
-        (mesh, primitive), *others = _find(path, gltf)
+    with rejected_if_damaged(path, "is damaged, or no .glb that is read here", _REMEDY):
+        gltf, binary = _chunks(memoryview(data))
+        (mesh, primitive), *others = _find(gltf)
         attributes = primitive["attributes"]
-        degree = max(k for k in range(DEGREE + 1) if harmonics(k)[-1] in attributes)
         names = dict(_ATTRIBUTES)
         dial = [name for name, stored in DIAL_ATTRIBUTES.items() if stored in attributes]
         for name in dial_columns(dial):
             names[name] = DIAL_ATTRIBUTES[name], 1
         arrays = {
-            key: _values(path, gltf, binary, attributes[name], width)
+            key: _values(gltf, binary, attributes[name], width)
             for key, (name, width) in names.items()
         }
         coefficients = [
-            _values(path, gltf, binary, attributes[name], 3) for name in harmonics(degree)[1:]
+            _values(gltf, binary, attributes[name], 3)
+            for name in harmonics(3)[1:]
+            if name in attributes
         ]
         if len(set(map(len, (*arrays.values(), *coefficients)))) > 1:
-            raise ClodError(f"{path}: its attributes are of different lengths; {_REMEDY}")
+            raise ValueError("its attributes are of different lengths")
         text = gltf["asset"].get("extras", {}).get(KEY)
-        scale, turned, moved = _placed(path, gltf, mesh)
+        scale, turned, moved = _placed(gltf, mesh)
     space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
     notes = []
     if space != COLOR_SPACE:
@@ -220,27 +212,22 @@ def read(path: Path, data: bytes) -> Source:
         notes.append(f"its node scales it by {scale:g}, which is applied")
     if moved != metadata.origin:  # another program moved the node
         world_means = stored["means"].astype(np.float64) + moved
-        fits_float32 = not any(origin_of(world_means))  # float32 has enough digits
-        stored["means"] = world_means if fits_float32 else stored["means"]
-        metadata = replace(metadata, origin=NOWHERE if fits_float32 else moved)
+        if not any(origin_of(world_means)):  # float32 has enough digits
+            stored["means"] = world_means
+            moved = NOWHERE
+        metadata = replace(metadata, origin=moved)
     return Source(stored, metadata, tuple(notes), metadata.about)
 
 
-def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
-    """The JSON and the binary chunk."""
-    head = bytes(data[:20]).ljust(20, b"\0")
-    version, length = struct.unpack_from("<II", head, 4)
-    size, kind = struct.unpack_from("<II", head, 12)
-    is_whole = version == 2 and kind == _JSON and max(length, 20 + size) <= len(data)
-    binary_size = (
-        struct.unpack_from("<I", data, 20 + size)[0] if is_whole and 28 + size <= length else 0
-    )
-    if not is_whole or (binary_size and 28 + size + binary_size > len(data)):
-        raise ClodError(f"{path}: is truncated, or no glTF 2.0; copy or export it again")
-    return json.loads(bytes(data[20 : 20 + size])), data[28 + size : 28 + size + binary_size]
+def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
+    """The JSON chunk, and what follows its head of the binary chunk."""
+    version, size, kind = struct.unpack_from("<4xI4xII", data)
+    if version != 2 or kind != _JSON or 20 + size > len(data):
+        raise ValueError("it is truncated, or no glTF 2.0")
+    return json.loads(bytes(data[20 : 20 + size])), data[28 + size :]
 
 
-def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     """The primitives with Gaussians, at least one, each after the number of its mesh."""
     primitives = []
     for number, mesh in enumerate(gltf.get("meshes", [])):
@@ -248,42 +235,30 @@ def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
             if EXTENSION in primitive.get("extensions", {}):
                 primitives.append((number, primitive))
     if not primitives:
-        raise ClodError(
-            f"{path}: has no Gaussians ({EXTENSION}), so it is a mesh; give a checkpoint of"
-            " Gaussians"
-        )
+        raise ValueError(f"it has no Gaussians, {EXTENSION}, so it is a mesh")
     first = primitives[0][1]
     compressed = first["extensions"][EXTENSION].get("extensions")
     if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
-        raise ClodError(
-            f"{path}: its Gaussians are compressed, or have no spherical harmonics; export them as"
-            " a .ply"
-        )
+        raise ValueError("its Gaussians are compressed, or have no spherical harmonics")
     return primitives
 
 
-def _values(
-    path: Path, gltf: dict[str, Any], binary: memoryview, number: int, width: int
-) -> np.ndarray:
+def _values(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> np.ndarray:
     """``[N, width]`` float32, the values of an accessor; ``[N]`` where the width is 1."""
     accessor = gltf["accessors"][_count(number)]
     if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
-        raise ClodError(
-            f"{path}: an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}"
-        )
+        raise ValueError(f"an attribute is sparse or of type {accessor['type']!r:.20}")
     kind = np.dtype(_KINDS[accessor["componentType"]])
     view = gltf["bufferViews"][_count(accessor["bufferView"])]
     if _count(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
-        raise ClodError(f"{path}: its data are compressed, or in another file; {_REMEDY}")
+        raise ValueError("its data are compressed, or in another file")
     size = kind.itemsize * width
     stride = _count(view.get("byteStride", size))
     start = _count(accessor.get("byteOffset", 0))
     count = _count(accessor["count"])
     data = binary[_count(view.get("byteOffset", 0)) :][: _count(view["byteLength"])]
     if not count or stride < size or start + (count - 1) * stride + size > len(data):
-        raise ClodError(
-            f"{path}: an attribute has no values, or more than the file; copy or export it again"
-        )
+        raise ValueError("an attribute has no values, or more than the file")
     stored = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
     numbers = stored.astype(np.float32)
     if accessor.get("normalized") and kind.kind != "f":
@@ -297,39 +272,38 @@ def _count(value: Any) -> int:
     return value
 
 
-def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, Origin]:
+def _placed(gltf: dict[str, Any], mesh: int) -> tuple[float, bool, Origin]:
     """The placement of a mesh by the nodes above it: their scale, whether they make the half turn,
     and their translation as an origin in the axes of checkpoints.
     """
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
     parents: dict[int, int] = {}
+    above = None
     for number, node in enumerate(nodes):
         parents |= dict.fromkeys(map(_count, node.get("children", [])), number)
-    owners = (number for number, node in enumerate(nodes) if node.get("mesh") == mesh)
-    above = next(owners, None)
+        if node.get("mesh") == mesh and above is None:
+            above = number
     placed = np.eye(4)
-    for _ in nodes:  # at most as many are above each other
-        if above is not None:
-            placed = _matrix(path, nodes[above]) @ placed
-            above = parents.get(above)
-    if above is not None:
-        raise ClodError(f"{path}: its nodes are above each other in a circle; export it again")
+    seen = set()
+    while above is not None:
+        if above in seen:
+            raise ValueError("its nodes are above each other in a circle")
+        seen.add(above)
+        placed = _matrix(nodes[above]) @ placed
+        above = parents.get(above)
     linear = placed[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
-    turned = linear[0, 0] < 0
+    turned = bool(linear[0, 0] < 0)
     straight = np.diag([-1.0, -1.0, 1.0] if turned else [1.0, 1.0, 1.0])
     if scale <= 0 or not np.allclose(linear, scale * straight, rtol=0, atol=1e-5 * scale):
-        raise ClodError(
-            f"{path}: its node is turned, mirrored or stretched, which is not undone; apply that"
-            " and export it again"
-        )
-    x, y, z = map(float, placed[:3, 3])
+        raise ValueError("its node is turned, mirrored or stretched, which is not undone")
     if abs(scale - 1) < 1e-6:
         scale = 1.0  # a rounded one, which changes no value
-    return scale, bool(turned), (0.0 - x, 0.0 - y, z)
+    x, y, z = placed[:3, 3].tolist()
+    return scale, turned, (0.0 - x, 0.0 - y, z)
 
 
-def _matrix(path: Path, node: dict[str, Any]) -> np.ndarray:
+def _matrix(node: dict[str, Any]) -> np.ndarray:
     """``[4, 4]`` transformation of a node, from its own axes into its parent's."""
     from scipy.spatial.transform import Rotation
 
@@ -337,11 +311,11 @@ def _matrix(path: Path, node: dict[str, Any]) -> np.ndarray:
         matrix = np.array(node["matrix"], np.float64).reshape(4, 4).T
     else:
         matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_quat(node.get("rotation", IDENTITY)).as_matrix()
-        matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64)
+        turn = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
+        matrix[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64)
         matrix[:3, 3] = node.get("translation", [0, 0, 0])
     if not np.isfinite(matrix).all():
-        raise ClodError(f"{path}: its node has numbers that are not finite; export it again")
+        raise ValueError("its node has numbers that are not finite")
     return matrix
 
 
