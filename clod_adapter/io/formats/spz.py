@@ -41,7 +41,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ
 from clod_adapter.io.formats import splat_transform
-from clod_adapter.io.settings import DAMAGED, MODEL, TAG, Metadata, Source, document, parse_metadata
+from clod_adapter.io.settings import MODEL, TAG, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, bytes_of, dial_columns
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
@@ -56,6 +56,9 @@ EXTENDED = 2  # flag of records after the arrays
 MOST_GAUSSIANS = 10_000_000  # Gaussians that the reference reads
 COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
+# of the components of a rotation: the others than each, and where their bits begin
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_SHIFTS = [20, 10, 0]
 _STEP = 4  # of the harmonics, which have 6 bits
 _MOST = float(np.finfo(np.float16).max)
 # world units: a reference distance, from which on some sigma_d that fade at high dial values exceed
@@ -155,22 +158,16 @@ def _packed(arrays: dict[str, np.ndarray], bits: int) -> list[bytes]:
 
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
-    """``[N]`` uint32: the largest component's index in xyzw, then of each other a sign and 9 bits,
-    over sqrt(1/2).
+    """``[N, 1]`` uint32: the index of the largest component in xyzw, then of each other a sign and 9
+    bits, over sqrt(1/2).
     """
     xyzw = np.roll(values.normalized(quats), -1, axis=1).astype(np.float64)
-    rows = np.arange(len(xyzw))
-    largest = np.abs(xyzw).argmax(1)
-    xyzw *= np.where(xyzw[rows, largest] < 0, -1.0, 1.0)[:, None]
-    packed = largest.astype(np.uint32)
-    for axis in range(4):
-        component = xyzw[:, axis]
-        level = np.floor(MAGNITUDE * np.abs(component) + 0.5)
-        level = level.clip(max=511).astype(np.uint32)
-        sign = np.uint32(512) * (component < 0)
-        longer = (packed << 10) | sign | level
-        packed = np.where(largest == axis, packed, longer)
-    return packed.astype("<u4")
+    largest = np.abs(xyzw).argmax(1)[:, None]
+    signs = np.sign(np.take_along_axis(xyzw, largest, 1))
+    others = signs * np.take_along_axis(xyzw, _OTHERS[largest[:, 0]], 1)
+    levels = np.floor(MAGNITUDE * np.abs(others) + 0.5).clip(max=511).astype(np.int64)
+    fields = levels + 512 * (others < 0)
+    return ((largest << 30) + (fields << _SHIFTS).sum(1, keepdims=True)).astype("<u4")
 
 
 def _losses(arrays: dict[str, np.ndarray], bits: int) -> list[str]:
@@ -263,16 +260,13 @@ def _records(data: bytes) -> dict[int, bytes]:
 
 def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The JSON document of our record, and the columns of the dial if they are there."""
-    length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
-    text = body[4 : 4 + length]
-    halves = body[4 + length :]
-    with rejected_if_damaged(path, *DAMAGED):
-        stored = json.loads(text)
+    with rejected_if_damaged(path, "its record of sigma_d is damaged"):
+        (length,) = struct.unpack_from("<I", body)
+        stored = json.loads(body[4 : 4 + length])
         names = stored.get(COLUMNS, [SIGMA])
-        known_names = list(dial_columns(names)) if isinstance(names, list) else []
-    if not known_names or names != known_names or len(halves) not in (0, 2 * count * len(names)):
-        raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
-    table = np.frombuffer(halves, "<f2").astype(np.float32).reshape(-1, count)
+        table = np.frombuffer(body[4 + length :], "<f2").astype(np.float32).reshape(-1, count)
+        if len(table) and (len(table) != len(names) or list(dial_columns(names)) != names):
+            raise ValueError(f"{len(table)} columns of {names!r:.40}")
     return stored, dict(zip(names, table, strict=False))  # no rows without a dial
 
 
@@ -297,15 +291,12 @@ def _unquantized(columns: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
 
 def _rotations(quats: np.ndarray) -> np.ndarray:
     """``[N, 4]`` wxyz; the inverse of ``_packed_quats``."""
-    packed = np.ascontiguousarray(quats).view("<u4")[:, 0]
+    packed = np.ascontiguousarray(quats).view("<u4")
     largest = packed >> 30
-    xyzw = np.zeros((len(packed), 4), np.float64)
-    for axis in (3, 2, 1, 0):
-        stored = largest != axis
-        value = (packed & 511) / MAGNITUDE
-        xyzw[:, axis] = np.where(stored, np.where(packed & 512, -value, value), 0)
-        packed = np.where(stored, packed >> 10, packed)
-    squares = (xyzw**2).sum(1)
-    rows = np.arange(len(xyzw))
-    xyzw[rows, largest] = np.sqrt(np.maximum(0, 1 - squares))
+    fields = packed >> _SHIFTS
+    others = (fields & 511) / MAGNITUDE * np.where(fields & 512, -1.0, 1.0)
+    xyzw = np.empty((len(packed), 4))
+    np.put_along_axis(xyzw, _OTHERS[largest[:, 0]], others, 1)
+    longest = np.sqrt(np.maximum(0, 1 - (others**2).sum(1, keepdims=True)))
+    np.put_along_axis(xyzw, largest, longest, 1)
     return np.roll(xyzw, 1, axis=1).astype(np.float32)
