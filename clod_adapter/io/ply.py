@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from plyfile import PlyData, PlyElement, PlyListProperty
 
 from clod_adapter.errors import ClodError, rejected_if_damaged
@@ -25,7 +26,6 @@ from clod_adapter.io.values import (
     GROWTH,
     MASKS,
     OPACITY,
-    ROWS,
     SIGMA,
     Arrays,
     degree_of,
@@ -116,8 +116,7 @@ def read(path: Path, data: bytes) -> Source:
     degree = sh_degree_of(path, head.ply)
     _check_length(path, head, len(data))
     with rejected_if_damaged(path):
-        elements = _elements(data, head)
-    rows = elements["vertex"]
+        rows = _vertices(data, head)
     notes = [*head.notes, *of_another_method(rows.dtype.names or ())]
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, head.comments, rows, dial=SIGMA in arrays)
@@ -129,35 +128,30 @@ def read(path: Path, data: bytes) -> Source:
     return Source(arrays, metadata, tuple(notes), head.comments, not metadata.described, rows, head)
 
 
-def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
-    """The rows of elements by name, native byte order, of all bytes of a file.
+def _vertices(data: bytes, head: Head) -> np.ndarray:
+    """The rows of the Gaussians, native byte order, of all bytes of a file.
 
-    plyfile reads text, and binary lists row by row: elements from the first with lists on are left
-    out where the Gaussians stand before it.
+    plyfile reads text, and binary files with lists before the Gaussians, row by row.
     """
-    elements: dict[str, np.ndarray] = {}
     at = head.size
-    for element, count in () if head.ply.text else head.elements:
-        if "list" in column_types(element).values():
+    for element, count in head.elements:
+        if head.ply.text or "list" in column_types(element).values():
             break
         kind = np.dtype(element.dtype(head.ply.byte_order))
-        elements[element.name] = np.frombuffer(data, kind, count, at)
+        if element.name == "vertex":
+            rows = np.frombuffer(data, kind, count, at)
+            return rows.astype(kind.newbyteorder("="), copy=False)
         at += count * kind.itemsize
-    if "vertex" not in elements:
-        # CR ends a line too
-        lines = io.TextIOWrapper(io.BytesIO(data if head.ply.text else b""), "latin-1")
-        if any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), "")):
-            # the parser copies a row several times
+    if head.ply.text:
+        lines = io.TextIOWrapper(io.BytesIO(data), "latin-1")  # CR ends a line too
+        if any(len(line) > _LONGEST for line in lines):  # the parser copies a row several times
             raise ValueError(f"a row of more than {_LONGEST:,} characters")
-        with warnings.catch_warnings(), np.errstate(over="ignore"):
-            warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            # a copy if it was changed
-            content = data if data.startswith(head.text) else head.text + data[head.size :]
-            elements = {element.name: element.data for element in PlyData.read(io.BytesIO(content))}
-    return {
-        name: rows.astype(rows.dtype.newbyteorder("="), copy=False)
-        for name, rows in elements.items()
-    }
+    with warnings.catch_warnings(), np.errstate(over="ignore"):
+        warnings.simplefilter("ignore")  # of text that is beyond float32's range
+        # a copy if it was changed
+        content = data if data.startswith(head.text) else head.text + data[head.size :]
+        rows = PlyData.read(io.BytesIO(content))["vertex"].data
+    return rows.astype(rows.dtype.newbyteorder("="), copy=False)
 
 
 def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
@@ -166,25 +160,19 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     """
     names = rows.dtype.names or ()
     groups = column_map(sh_degree) | dial_columns(names)
-    groups |= {MASKS: MASK_COLUMNS} if set(MASK_COLUMNS) <= set(names) else {}
-    groups |= {FILTER_3D: (FILTER_3D,)} if FILTER_3D in names else {}
-    arrays: Arrays = {}
-    for key, group in groups.items():
-        arrays[key] = np.empty((len(rows), len(group)), "f4")
-    if any(rows.dtype[name].itemsize == 8 for name in "xyz"):
-        arrays["means"] = np.empty((len(rows), 3))
+    groups |= {MASKS: MASK_COLUMNS, FILTER_3D: (FILTER_3D,)}
+    arrays: Arrays = {"shN": np.zeros((len(rows), 0), np.float32)}  # of degree 0
     with np.errstate(over="ignore", invalid="ignore"):  # invalid: a NaN that signals
-        for start in range(0, len(rows), ROWS):  # a block stays in cache, which is 8 times faster
-            block = rows[start : start + ROWS]
-            for key, group in groups.items():
-                target = arrays[key][start : start + ROWS]
-                for column, name in enumerate(group):
-                    target[:, column] = block[name]
+        for key, group in groups.items():
+            if group and set(group) <= set(names):
+                doubles = any(rows.dtype[name].itemsize == 8 for name in group)
+                kind = np.dtype("f8" if key == "means" and doubles else "f4")
+                arrays[key] = structured_to_unstructured(rows[list(group)], kind, copy=True)
     for name in ("opacity_logits", SIGMA, GROWTH, OPACITY):
         if name in arrays:
             arrays[name] = arrays[name][:, 0]
-    for name in ("sh0", "shN"):
-        arrays[name] = arrays[name].reshape(len(rows), len(groups[name]) // 3, 3)
+    arrays["sh0"] = arrays["sh0"][:, None]
+    arrays["shN"] = arrays["shN"].reshape(len(rows), len(groups["shN"]) // 3, 3)
     return arrays
 
 

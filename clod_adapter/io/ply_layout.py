@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, astuple, fields, replace
-from itertools import product
+from itertools import product, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from plyfile import PlyData, PlyElement
 
 from clod_adapter._support.text import package_version
 from clod_adapter.calibration import CalibrationRow, Viewpoint
-from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig
+from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.settings import EARLIER_FORM, FILTER, Metadata, read_metadata, tagged
 from clod_adapter.io.values import (
@@ -38,6 +38,12 @@ if TYPE_CHECKING:
 
 PREFIX = "clod_adapter "
 COLUMN = "clod_"
+# of settings
+REFERENCE = "clod_reference_distance"
+NEAR = "clod_near_distance"
+PAPER = "clod_paper"
+VARIANCE = "clod_screen_variance"
+COMPENSATE = "clod_compensate"
 # Comments of the calibration: machine; total, views, width, height, reference; one for each row and
 # each viewpoint.
 MACHINE = "calibrated_on"
@@ -45,18 +51,8 @@ EXTENT = "calibrated_with"
 ROW = "calibrated"
 VIEWPOINT = "viewpoint"
 DIAL_GROUP = "attenuation"
-# Columns of settings: group, field, and what a column of 1 stands for where the setting is
-# no number.
-_SETTINGS: dict[str, tuple[str, str, Any]] = {
-    "reference_distance": (DIAL_GROUP, "reference_distance", None),
-    "near_distance": (DIAL_GROUP, "near_distance", None),
-    "paper": (DIAL_GROUP, "form", "paper"),
-    "screen_variance": (FILTER, "variance", None),
-    "compensate": (FILTER, "compensate", True),
-}
 # the columns of ``settings.EARLIER``
 _EARLIER = {"clod_tau", "clod_eps", "clod_hard_cut", "clod_max", "clod_quantile"}
-_USUAL = {DIAL_GROUP: asdict(AttenuationConfig()), FILTER: asdict(CLASSIC)}
 _INSTEAD = {SIGMA: "use a large number for no end", GROWTH: "use 0 for no growth"}
 
 
@@ -86,14 +82,17 @@ def ply_metadata(
     path: Path, comments: tuple[str, ...], rows: np.ndarray | None = None, *, dial: bool
 ) -> Metadata:
     """The settings of the comments, completed by those of the columns of ``rows``."""
-    columns = _constant_settings(path, rows) if dial and rows is not None else {DIAL_GROUP: {}}
+    values = _stored_settings(comments)
     ours = any(comment.startswith(PREFIX) for comment in comments)
-    values = columns | _stored_settings(comments)
-    values[DIAL_GROUP] = columns[DIAL_GROUP] | values[DIAL_GROUP]
+    columns = {}
+    if dial and rows is not None and len(rows):
+        stored = _constant_settings(path, rows)
+        columns = stored.pop(DIAL_GROUP)
+        values = stored | values | {DIAL_GROUP: columns | values[DIAL_GROUP]}
     metadata = read_metadata(path, values, dial=dial, described=ours)
-    if ours or not columns[DIAL_GROUP]:
+    if ours or not columns:
         return metadata
-    note = f"settings of the dial read from columns: {', '.join(columns[DIAL_GROUP])}"
+    note = f"settings of the dial read from columns: {', '.join(columns)}"
     return replace(metadata, notes=(note, *metadata.notes))
 
 
@@ -108,7 +107,7 @@ def write_comments(metadata: Metadata) -> list[str]:
     screen_filter = metadata.screen_filter or CLASSIC
     lines = [f"version {metadata.version or package_version()}"]
     if metadata.attenuation is not None:
-        for name, usual in _USUAL[DIAL_GROUP].items():
+        for name, usual in asdict(AttenuationConfig()).items():
             lines.append(f"{name} {type(usual)(getattr(metadata.attenuation, name))}")
     if screen_filter != CLASSIC:
         lines.append(f"{FILTER} {screen_filter.variance} {screen_filter.compensate}")
@@ -125,35 +124,32 @@ def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
     """The settings in the comments, as ``settings.read_metadata`` takes them; the last of equal
     names counts.
     """
-    stored: dict[str, list[list[str]]] = {}
+    settings: dict[str, str] = {}
+    measured: dict[str, Any] = {"rows": [], "viewpoints": []}
     for line in comments:
         if line.startswith(PREFIX):
-            name, *words = line[len(PREFIX) :].split() or [""]
-            stored.setdefault(name, []).append(words)
-    values: dict[str, Any] = {}
-    if FILTER in stored:
-        values[FILTER] = dict(zip(_USUAL[FILTER], stored.pop(FILTER)[-1], strict=False))
-    measured: dict[str, Any] = {
-        "rows": _by_field(CalibrationRow, stored.pop(ROW, [])),
-        "viewpoints": _by_field(Viewpoint, stored.pop(VIEWPOINT, [])),
-    }
-    settings = {}
-    for name, lines in stored.items():
-        if lines[-1]:
-            settings[name] = " ".join(lines[-1])
+            name, _, text = line.removeprefix(PREFIX).partition(" ")
+            if name == ROW:
+                measured["rows"].append(_by_name(CalibrationRow, text))
+            elif name == VIEWPOINT:
+                measured["viewpoints"].append(_by_name(Viewpoint, text))
+            else:
+                settings[name] = text.strip()
+    values: dict[str, Any] = {"package_version": settings.pop("version", "")}
+    if FILTER in settings:
+        values[FILTER] = _by_name(ScreenFilter, settings.pop(FILTER))
     extent = settings.pop(EXTENT, "").split(maxsplit=4)
     measured |= zip(("total", "views", "width", "height", "against"), extent, strict=False)
     if MACHINE in settings:
         measured["machine"] = settings.pop(MACHINE)
     if any(measured.values()):
         values["calibration"] = measured
-    return values | {"package_version": settings.pop("version", ""), DIAL_GROUP: settings}
+    return values | {DIAL_GROUP: settings}
 
 
-def _by_field(kind: type, lines: Iterable[list[str]]) -> list[dict[str, str]]:
-    """The words of each line by the fields of a dataclass."""
-    names = [field.name for field in fields(kind)]
-    return [dict(zip(names, words, strict=False)) for words in lines]
+def _by_name(kind: type, text: str) -> dict[str, str]:
+    """The words of a text by the fields of a dataclass."""
+    return dict(zip([field.name for field in fields(kind)], text.split(), strict=False))
 
 
 def constants_of(metadata: Metadata, *, growth: bool) -> dict[str, float]:
@@ -162,42 +158,53 @@ def constants_of(metadata: Metadata, *, growth: bool) -> dict[str, float]:
     """
     if metadata.attenuation is None:  # a plain file has the columns of Inria's layout and no others
         return {}
-    settings = {
-        DIAL_GROUP: asdict(metadata.attenuation),
-        FILTER: asdict(metadata.screen_filter or CLASSIC),
+    usual = _as_columns(AttenuationConfig(), CLASSIC)
+    columns = _as_columns(metadata.attenuation, metadata.screen_filter or CLASSIC)
+    if not growth:
+        del columns[REFERENCE]
+    return {name: value for name, value in columns.items() if value != usual[name]}
+
+
+def _as_columns(config: AttenuationConfig, screen_filter: ScreenFilter) -> dict[str, float]:
+    return {
+        REFERENCE: config.reference_distance,
+        NEAR: config.near_distance,
+        PAPER: float(config.form == "paper"),
+        VARIANCE: screen_filter.variance,
+        COMPENSATE: float(screen_filter.compensate),
     }
-    columns = {}
-    for name, (group, field, word) in _SETTINGS.items():
-        value = settings[group][field]
-        needed = growth or field != "reference_distance"
-        if needed and value != _USUAL[group][field] and word in (None, value):
-            columns[COLUMN + name] = value if word is None else 1.0
-    return columns
 
 
-def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, Any]:
+def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, dict[str, Any]]:
     """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of
     ``constants_of``.
     """
-    settings: dict[str, dict[str, Any]] = {DIAL_GROUP: {}, FILTER: {}}
-    columns = (vertex.dtype.names or ()) if len(vertex) else ()
-    if _EARLIER & {*columns}:
+    names = vertex.dtype.names or ()
+    if _EARLIER & {*names}:
         raise ClodError(f"{path}: {EARLIER_FORM}")
-    for name, (group, field, word) in _SETTINGS.items():
-        if COLUMN + name in columns:
-            column = vertex[COLUMN + name]
+    found = {}
+    for name in _as_columns(AttenuationConfig(), CLASSIC):
+        if name in names:
+            column = vertex[name]
             if not (column == column[0]).all():
                 raise ClodError(
-                    f"{path}: property {COLUMN}{name} must be one value for all rows and has"
-                    " several, so files of different settings were merged; give one of them"
+                    f"{path}: property {name} must be one value for all rows and has several, so"
+                    " files of different settings were merged; give one of them"
                 )
-            if word is None:  # the shortest decimal of a float32 is the number that was written
-                settings[group][field] = float(str(np.float32(column[0])))
-            elif column[0]:
-                settings[group][field] = word
-    if settings[FILTER]:
-        return settings | {FILTER: _USUAL[FILTER] | settings[FILTER]}
-    return {DIAL_GROUP: settings[DIAL_GROUP]}
+            # the shortest decimal of a float32 is the number that was written
+            found[name] = float(str(np.float32(column[0])))
+    dial: dict[str, Any] = {}
+    if REFERENCE in found:
+        dial["reference_distance"] = found[REFERENCE]
+    if NEAR in found:
+        dial["near_distance"] = found[NEAR]
+    if found.get(PAPER):
+        dial["form"] = "paper"
+    if VARIANCE not in found and COMPENSATE not in found:
+        return {DIAL_GROUP: dial}
+    variance = found.get(VARIANCE, CLASSIC.variance)
+    compensate = bool(found.get(COMPENSATE))
+    return {DIAL_GROUP: dial, FILTER: {"variance": variance, "compensate": compensate}}
 
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
@@ -227,7 +234,6 @@ def write_rows(
             layout. The others are far Gaussians (``values.OPACITY``), whose other columns are 0.
     """
     tensors = hidden(gaussians)
-    origin = metadata.origin
     constants = constants_of(metadata, growth=gaussians.growth_d is not None)
     dial = dial_columns(tensors)
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
@@ -236,7 +242,7 @@ def write_rows(
     dropped = {FILTER_3D, *((SIGMA, GROWTH, OPACITY) if dial else dial_columns(names))}
     copied = [name for name in names if name not in dropped and not name.startswith(COLUMN)]
     kinds = {name: layout[name] for name in copied}
-    if any(origin):
+    if any(metadata.origin):
         kinds |= dict.fromkeys("xyz", np.dtype("f8"))
     kinds |= dict.fromkeys((*constants, *dial), np.dtype("f4"))
     kind = np.dtype(list(kinds.items()))
@@ -255,16 +261,12 @@ def write_rows(
             for name, value in constants.items():
                 block[name] = value
             for attribute, group in (column_map(gaussians.sh_degree) | dial).items():
-                values = tensors[attribute][rows].float().cpu().numpy()
-                values = values.reshape(len(block), -1)
-                for k, name in enumerate(group):
-                    shift = origin[k] if attribute == "means" else 0.0
-                    is_stored = base is not None and name not in dial
-                    new = _overwrite(block[name], values[:, k], shift, is_stored)
-                    usable = np.isfinite(new)
-                    if attribute == "opacity_logits" and base is None:
-                        usable |= new == np.inf
-                    if not usable.all():
+                values = tensors[attribute][rows].float().cpu().numpy().reshape(len(block), -1)
+                origin = metadata.origin if attribute == "means" else repeat(0.0)
+                for name, column, shift in zip(group, values.T, origin, strict=False):
+                    new = _overwrite(block[name], column, shift)
+                    opaque = attribute == "opacity_logits" and base is None
+                    if not (np.isfinite(new) | (opaque & (new == np.inf))).all():
                         fix = _INSTEAD.get(attribute, "the tuning has diverged")
                         raise ClodError(
                             f"{path}: {attribute} holds a new value that is not finite; {fix}"
@@ -273,14 +275,10 @@ def write_rows(
     return ()
 
 
-def _overwrite(column: np.ndarray, values: np.ndarray, shift: float, is_stored: bool) -> np.ndarray:
-    """Puts values, plus ``shift``, into a column, of one that ``is_stored`` where they are not its
-    own; returns the new ones.
-    """
-    changed = np.ones(len(column), bool)
-    if is_stored:
-        old = (column - shift if shift else column).astype(np.float32)
-        changed = values.view(np.uint32) != old.view(np.uint32)
+def _overwrite(column: np.ndarray, values: np.ndarray, shift: float) -> np.ndarray:
+    """Puts values, plus ``shift``, into a column where they are not its own; returns those put."""
+    old = (column - shift if shift else column).astype(np.float32)
+    changed = values.view(np.uint32) != old.view(np.uint32)
     new = values[changed]
     column[changed] = new.astype(np.float64) + shift if shift else new
     return new

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
+from scipy import special
 
 from clod_adapter.config import SH_COUNTS, require
 from clod_adapter.errors import ClodError
@@ -33,6 +34,12 @@ MASKS = "masks"
 OPACITY = "opacity_d"
 INVISIBLE = -20.0  # logit
 ROWS = 4096  # in a block, which stays in the processor's cache
+# why a Gaussian is dropped, by the first that applies
+_RULES = (
+    "MaskGaussian existence probability below 0.5",
+    "a value is not finite",
+    "rotation is zero or not of a usable length",
+)
 _FEW = 10  # Gaussians; fewer may have any range
 # logit of 0.475; trainers keep fainter Gaussians, and files of |a| reach just below 0
 _FAINTEST = -0.1
@@ -182,17 +189,11 @@ def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, floa
     if 2 * np.count_nonzero(opacity > 1) > len(opacity):
         candidates = candidates[1:]
     for name, values, least in candidates:
-        low = np.inf
-        high = -np.inf
-        count = 0
-        for start in range(0, len(values), ROWS):
-            block = values[start : start + ROWS]
-            block = block[np.isfinite(block).all(1)]
-            low = float(block.min(initial=low))
-            high = float(block.max(initial=high))
-            count += len(block)
-        if count >= _FEW and low >= least and (low < high or high == 1):
-            ranges[name] = low, high
+        finite = values[np.isfinite(values).all(1)]
+        if len(finite) >= _FEW:
+            low, high = float(finite.min()), float(finite.max())
+            if low >= least and (low < high or high == 1):
+                ranges[name] = low, high
     return ranges
 
 
@@ -227,31 +228,26 @@ def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
     """
     from clod_adapter._kernels import QUAT_MAX, QUAT_MIN  # here: a header is checked without numba
 
-    keep = np.ones(len(arrays["means"]), bool)
-    dropped = {
-        "MaskGaussian existence probability below 0.5": 0,
-        "a value is not finite": 0,
-        "rotation is zero or not of a usable length": 0,
-    }
-    for start in range(0, len(keep), ROWS):
+    broken = np.zeros(len(arrays["means"]), np.uint8)  # the number of a rule
+    for start in range(0, len(broken), ROWS):
+        rules = broken[start : start + ROWS]
         block = {name: values[start : start + ROWS] for name, values in arrays.items()}
-        exists, finite = np.ones((2, len(block["means"])), bool)
-        if MASKS in block:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
-            exists = ~(block[MASKS][:, 0] < block[MASKS][:, 1])
-        for name, values in block.items():
-            usable = np.isfinite(values)
-            if name == "opacity_logits":
-                usable |= values == np.inf
-            if not usable.all():  # which is far faster than by rows
-                finite &= usable.reshape(len(usable), -1).all(1)
         with np.errstate(over="ignore", invalid="ignore"):
             length = np.sqrt(np.square(block["quats"]).sum(1))  # that rasterizers divide by
-        rotated = (length >= QUAT_MIN) & (length <= QUAT_MAX)
-        keep_block = keep[start : start + ROWS]
-        for reason, rule in zip(dropped, (exists, finite, rotated), strict=True):
-            dropped[reason] += int((keep_block & ~rule).sum())
-            keep_block &= rule
-    return keep, {reason: lost for reason, lost in dropped.items() if lost}
+        rules[~((length >= QUAT_MIN) & (length <= QUAT_MAX))] = 3
+        for name, values in block.items():
+            usable = np.isfinite(values)
+            if name in ("opacity_logits", OPACITY):
+                usable |= values == np.inf
+            if not usable.all():  # which is far faster than by rows
+                rules[~usable.reshape(len(rules), -1).all(1)] = 2
+        if MASKS in block:  # sigmoid(first - second) < 0.5
+            rules[block[MASKS][:, 0] < block[MASKS][:, 1]] = 1
+    dropped = {}
+    for rule, reason in enumerate(_RULES, start=1):
+        if count := int((broken == rule).sum()):
+            dropped[reason] = count
+    return broken == 0, dropped
 
 
 def hidden(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -269,20 +265,12 @@ def hidden(gaussians: Gaussians) -> dict[str, Tensor]:
 
 def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
     """The float32 arrays of ``hidden``; rejects values that ``load`` would drop."""
-    arrays = _on_the_host(gaussians.tensors())
+    arrays = {}
+    for name, tensor in hidden(gaussians).items():
+        arrays[name] = tensor.float().cpu().contiguous().numpy()
     if dropped := _usable(arrays)[1]:
-        spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()]
-        names = ", ".join(spoilt or ["quats"])
-        raise ClodError(
-            f"{path}: {names}: {', '.join(dropped)}; drop such rows first, as load does"
-        )
-    return _on_the_host(hidden(gaussians))  # without copies, on a CPU
-
-
-def _on_the_host(tensors: Mapping[str, Tensor]) -> Arrays:
-    return {
-        name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()
-    }
+        raise ClodError(f"{path}: {', '.join(dropped)}; drop such rows first, as load does")
+    return arrays
 
 
 def half_turn(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -291,15 +279,12 @@ def half_turn(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations
     ``P R P``, which gives the same ellipsoids, and harmonics of an odd order change sign.
     """
-    harmonics = []
-    for degree in range(1, 4):
-        harmonics += [(-1) ** order for order in range(-degree, degree + 1)]
-    bands = arrays["shN"].shape[1]
+    signs = -((-1) ** np.arange(arrays["shN"].shape[1]))  # orders -1, 0, 1, -2, -1, ...
     return {
         **arrays,
         "means": arrays["means"] * np.array([-1, -1, 1], np.float32),
         "quats": arrays["quats"] * np.array([1, -1, -1, 1], np.float32),
-        "shN": arrays["shN"] * np.array(harmonics[:bands], np.float32)[:, None],
+        "shN": arrays["shN"] * signs.astype(np.float32)[:, None],
     }
 
 
@@ -312,15 +297,12 @@ def normalized(quats: np.ndarray) -> np.ndarray:
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
     """Opacities of logits, in float64; 1 for +inf."""
-    with np.errstate(over="ignore"):
-        return 1 / (1 + np.exp(-logits.astype(np.float64)))
+    return special.expit(logits.astype(np.float64))
 
 
 def logit(opacities: np.ndarray) -> np.ndarray:
     """The inverse of ``sigmoid``."""
-    wide = opacities.astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(wide) - np.log1p(-wide)
+    return special.logit(opacities.astype(np.float64))
 
 
 def scales_of(path: Path, log_scales: np.ndarray) -> np.ndarray:

@@ -158,8 +158,8 @@ def _packed(arrays: dict[str, np.ndarray], bits: int) -> list[bytes]:
 
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
-    """``[N, 1]`` uint32: the index of the largest component in xyzw, then of each other a sign and 9
-    bits, over sqrt(1/2).
+    """``[N, 1]`` uint32: the index of the largest component in xyzw, then of each other a sign and
+    9 bits, over sqrt(1/2).
     """
     xyzw = np.roll(values.normalized(quats), -1, axis=1).astype(np.float64)
     largest = np.abs(xyzw).argmax(1)[:, None]
