@@ -43,7 +43,6 @@ OTHERS = {
 }  # by what is in their first 12 bytes, for the message
 
 LARGE = 1 << 26  # pixels; a larger photograph is reduced first
-BAND = 64  # rows of the reduced photograph that are made at a time
 REDUCED = f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first"
 Turn = Image.Transpose
 # EXIF orientations that swap the sides
@@ -92,11 +91,13 @@ def read_image(
             source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
             factor = max(1, factor * source.width // size[0])
             notes.append((REDUCED, ""))
-        pixels = _rgb(path, source, factor, notes)
+        pixels = _rgb(path, source, notes)
+    if factor > 1:
+        pixels = pixels.reduce(factor)
     if turn is not None:
         pixels = pixels.transpose(turn)
         notes.append(("rotated by their EXIF orientation, as the cameras are", ""))
-    return pixels, list(dict.fromkeys(notes))
+    return pixels, notes
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -129,49 +130,32 @@ def _same_shape(size: tuple[int, int], width: int, height: int) -> bool:
     return abs(size[0] * height / (size[1] * width) - 1) <= 0.01
 
 
-def _rgb(path: Path, source: Image.Image, factor: int, notes: list[Note]) -> Image.Image:
-    """The photograph in 8-bit RGB, its width and height divided by ``factor``."""
+def _rgb(path: Path, source: Image.Image, notes: list[Note]) -> Image.Image:
+    """The photograph in 8-bit RGB."""
     tags: dict[int, Any] = getattr(source, "tag_v2", {})  # a TIFF's
     # Pillow would take each byte for a pixel
     if tags.get(_PLANES) == 2 and max(tags.get(_BITS) or (8,)) > 8:
         raise ClodError(
             f"{path}: has more than 8 bits in planes of one colour each; convert it to 8 bits"
         )
-    deep = source.mode.startswith("I;16") or (source.mode == "I" and source.format == "PNG")
-    if source.mode in ("I", "F") and not deep:
+    if source.mode.startswith("I;16") or (source.mode == "I" and source.format == "PNG"):
+        # grey; 16-bit colour Pillow has brought to 8 bits itself
+        values = np.asarray(source).astype(np.uint32)
+        return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
+    if source.mode in ("I", "F"):
         raise ClodError(
             f"{path}: has 32 bits per channel, whose range is not known; convert it to 8 bits"
         )
     if source.mode == "CMYK":
         notes.append(("are CMYK: brought to RGB without their colour profile", ""))
-    if factor == 1:
-        return _converted(source, deep, notes)
-    source.load()
-    small = Image.new("RGB", (-(-source.width // factor), -(-source.height // factor)))
-    rows = factor * BAND
-    for top in range(0, source.height, rows):  # no copy of the whole is made
-        band = source.crop((0, top, source.width, min(top + rows, source.height)))
-        small.paste(_converted(band, deep, notes).reduce(factor), (0, top // factor))
-    return small
-
-
-def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Image:
-    if deep:
-        # grey; 16-bit colour Pillow has brought to 8 bits itself
-        values = np.asarray(source).astype(np.uint32)
-        bytes_of_grey = ((values + 128) // 257).astype(np.uint8)
-        return Image.fromarray(bytes_of_grey).convert("RGB")
-    if "A" not in source.getbands() and "transparency" not in source.info:
-        if source.mode != "RGB":
-            return source.convert("RGB")
+    if source.mode == "RGB" and "transparency" not in source.info:
         source.load()  # convert would copy it, a second photograph of full size in memory
         return source
     rgba = source.convert("RGBA")
-    if rgba.getchannel("A").getextrema() == (255, 255):
-        return rgba.convert("RGB")
-    notes.append(("have transparency: laid over black", ""))
-    black = Image.new("RGBA", rgba.size, (0, 0, 0, 255))
-    return Image.alpha_composite(black, rgba).convert("RGB")
+    if rgba.getchannel("A").getextrema() != (255, 255):
+        notes.append(("have transparency: laid over black", ""))
+        rgba = Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba)
+    return rgba.convert("RGB")
 
 
 def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None) -> Photograph:
