@@ -28,7 +28,6 @@ from clod_adapter.io.settings import (
     Metadata,
     matching_calibration,
     stated_filter,
-    tagged,
 )
 from clod_adapter.io.values import SIGMA, Activated, Prepared, prepared
 from clod_adapter.origin import NOWHERE, Origin
@@ -170,9 +169,9 @@ def load(
     if gaussians.attenuation is not None and not metadata.described:
         notes += plausibility(arrays, gaussians.attenuation)
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
-    about = [comment for comment in source.comments if not comment.startswith(PREFIX)]
-    if source.head is None:
-        about = tagged([re.sub("[^ -~]", "?", line) for line in about], screen_filter)
+    about = [
+        re.sub("[^\t -~]", "?", line) for line in source.comments if not line.startswith(PREFIX)
+    ]
     return Checkpoint(
         gaussians,
         rows,

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from clod_adapter._support.text import as_text
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.file_formats import read_bytes, reject_long_numbers
-from clod_adapter.io.scene.folder import FORMS, find_cameras, form_of, name_parts
+from clod_adapter.io.scene.folder import find_cameras, form_of, name_parts
 from clod_adapter.origin import NOWHERE
 
 try:
@@ -90,18 +90,21 @@ def marked(
 
     An entry may have another folder or suffix where only one name is the same otherwise.
     """
-    names = [image.name for image in images]
-    count = Counter(map(_stem, names))
-    known = {_stem(name): name for name in names if count[_stem(name)] == 1}
-    known.update(zip(names, names, strict=True))
-    named = {
-        known.get(PureWindowsPath(entry).as_posix(), known.get(_stem(entry))): entry
-        for entry in entries
-    }
-    notes = []
-    if None in named:
-        notes.append(f"names in {source} are of no photograph, such as {as_text(named[None])}")
-    testing = [(name in named) != training for name in names]
+    stems = Counter(_stem(image.name) for image in images)
+    known = {}
+    for image in images:
+        known[image.name] = image.name
+        if stems[_stem(image.name)] == 1:
+            known.setdefault(_stem(image.name), image.name)
+    named = set()
+    notes: list[str] = []
+    for entry in entries:
+        name = known.get(PureWindowsPath(entry).as_posix()) or known.get(_stem(entry))
+        if name:
+            named.add(name)
+        elif not notes:
+            notes.append(f"names in {source} are of no photograph, such as {as_text(entry)}")
+    testing = [(image.name in named) != training for image in images]
     if len(set(testing)) == 1:
         extent = "all" if testing[0] else "none"
         return images, [f"{source} holds out {extent} of the photographs and is not used", *notes]
@@ -177,22 +180,20 @@ def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.
     model.
     """
     model = find_cameras(Path(folder))
-    points = list[Sequence[float]]()
-    path = next((file for form in FORMS if (file := model / f"points3D{form}").is_file()), None)
-    if path is not None:
-        with rejected_if_damaged(path, DAMAGED):
-            points += (_points if path.suffix == ".bin" else _points_in_text)(path)
+    points: list[Sequence[float]] = []
+    for path in (model / "points3D.bin", model / "points3D.txt"):
+        if path.is_file() and not points:
+            with rejected_if_damaged(path, DAMAGED):
+                points = list((_points if path.suffix == ".bin" else _points_in_text)(path))
     return torch.from_numpy(np.array(points, np.float64).reshape(-1, 3) - origin)
 
 
 def _cameras(path: Path) -> dict[int, pycolmap.Camera]:
     cameras = {}
     with rejected_if_damaged(path, DAMAGED):
-        records = _camera_records(path) if path.suffix == ".bin" else _cameras_in_text(path)
-        for camera, params in records:
-            if len(params) != len(camera.params):
-                raise ValueError(f"camera {camera.camera_id} has {len(params)} parameters")
-            camera.params = params
+        for camera in (_camera_records if path.suffix == ".bin" else _cameras_in_text)(path):
+            if not camera.verify_params():
+                raise ValueError(f"camera {camera.camera_id} has {len(camera.params)} parameters")
             cameras[camera.camera_id] = camera
     return cameras
 
@@ -227,14 +228,15 @@ class _Records:
         self.at += size
 
 
-def _camera_records(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
+def _camera_records(path: Path) -> Iterator[pycolmap.Camera]:
     records = _Records(path)
     for _ in records.each():
         number, kind, *size = records.take("IiQQ")
         camera = pycolmap.Camera.create_from_model_id(
             number, pycolmap.CameraModelId(kind), 1.0, *size
         )
-        yield camera, list(records.take(f"{len(camera.params)}d"))
+        camera.params = list(records.take(f"{len(camera.params)}d"))
+        yield camera
 
 
 def _images(path: Path) -> Iterator[Image]:
@@ -263,14 +265,13 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
             yield number, line
 
 
-def _cameras_in_text(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
+def _cameras_in_text(path: Path) -> Iterator[pycolmap.Camera]:
     for _, line in _lines(path):
         number, kind, *values = line.split()
-        width, height = map(int, values[:2])
-        camera = pycolmap.Camera.create_from_model_name(
-            int(number), kind.decode(), 1.0, width, height
-        )
-        yield camera, [float(value) for value in values[2:]]
+        size = map(int, values[:2])
+        camera = pycolmap.Camera.create_from_model_name(int(number), kind.decode(), 1.0, *size)
+        camera.params = list(map(float, values[2:]))
+        yield camera
 
 
 def _images_in_text(path: Path) -> Iterator[Image]:
@@ -287,7 +288,7 @@ def _images_in_text(path: Path) -> Iterator[Image]:
             raise ValueError(
                 f"line {number} is neither an image with its camera and name nor keypoints of one"
             )
-        pose = [float(value) for value in fields[1:8]]
+        pose = list(map(float, fields[1:8]))
         yield Image(
             fields[9].decode("utf-8", "surrogateescape"), pose[:4], pose[4:], int(fields[8])
         )
@@ -302,4 +303,4 @@ def _is_keypoints(line: bytes) -> bool:
 
 def _points_in_text(path: Path) -> Iterator[Sequence[float]]:
     for _, line in _lines(path):
-        yield [float(value) for value in line.split(maxsplit=4)[1:4]]
+        yield list(map(float, line.split(maxsplit=4)[1:4]))

@@ -40,8 +40,7 @@ PERSPECTIVE = (
     "FULL_OPENCV",
 )
 
-# nerfstudio's, in its transforms.json
-LISTS = ("train_filenames", "val_filenames", "test_filenames")
+TRAINING = "train_filenames"  # nerfstudio's list in its transforms.json
 
 
 def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
@@ -114,18 +113,19 @@ def _split(
     path: Path, content: Mapping[str, Any], images: list[PosedImage]
 ) -> tuple[list[PosedImage], list[str]]:
     """The images, those held out on which nerfstudio does not train by its lists, and notes."""
-    lists = {key: content[key] for key in LISTS if content.get(key) is not None}
-    for key, entries in lists.items():
+    lists = {}
+    for key in (TRAINING, "val_filenames", "test_filenames"):
+        entries = content.get(key)
+        if entries is None:
+            continue
         if not isinstance(entries, list) or not all(isinstance(name, str) for name in entries):
             raise ClodError(f"{path}: {key} is no list of file names; correct or remove it")
         lists[key] = [with_ending(path.parent, name) or name for name in entries]
     if not lists:
         return images, []
-    source = f"the lists of {path.name}"
-    training = lists.pop(LISTS[0], None)
-    if training is not None:
-        return marked(images, training, source, training=True)
-    return marked(images, chain(*lists.values()), source)
+    training = TRAINING in lists
+    entries = lists[TRAINING] if training else list(chain(*lists.values()))
+    return marked(images, entries, f"the lists of {path.name}", training=training)
 
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
