@@ -29,8 +29,8 @@ Writer = Callable[..., tuple[str, ...]]
 
 class Format(NamedTuple):
     """A format. Its module has ``read``, of a path and the bytes of the file to a ``Source``
-    without their hash; if it is written also ``write``, of a path, Gaussians in world units and
-    their ``Metadata``, to a line for each loss.
+    without their hash, which may raise any error; if it is written also ``write``, of a path,
+    Gaussians in world units and their ``Metadata``, to a line for each loss.
     """
 
     module: str = ""  # under ``clod_adapter.io``, imported when it is used
@@ -121,7 +121,8 @@ def read_source(path: Path) -> Source:
 def _read(path: Path) -> Source:
     check_readable(path)
     data = read_bytes(path)  # once, and not mapped: another program may write the file meanwhile
-    source: Source = _call(f"{format_of(path).module}.read", path, data)
+    with rejected_if_damaged(path):
+        source: Source = _call(f"{format_of(path).module}.read", path, data)
     return source._replace(sha256=hashlib.sha256(data).hexdigest())
 
 

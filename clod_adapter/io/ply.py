@@ -115,8 +115,7 @@ def read(path: Path, data: bytes) -> Source:
     head = read_head(path, data)
     degree = sh_degree_of(path, head.ply)
     _check_length(path, head, len(data))
-    with rejected_if_damaged(path):
-        rows = _vertices(data, head)
+    rows = _vertices(data, head)
     notes = [*head.notes, *of_another_method(rows.dtype.names or ())]
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, head.comments, rows, dial=SIGMA in arrays)

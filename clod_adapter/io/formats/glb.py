@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from clod_adapter._support.text import package_version
-from clod_adapter.errors import ClodError, rejected_if_damaged
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import KEY
@@ -58,7 +58,6 @@ _ATTRIBUTES = {
     "opacity_logits": (f"{EXTENSION}:OPACITY", 1),
     "sh0": (harmonics(0)[0], 3),
 }
-_REMEDY = "export it again, as a .ply"
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 # a program that wrote SCALE so, whatever its range
 _LOGARITHMS = r"splat-transform 2\.([0-2]\.\d+|3\.[01])"
@@ -170,43 +169,38 @@ def read(path: Path, data: bytes) -> Source:
     Under a node without a rotation the values are in glTF's own axes, and are turned here; files of
     this package have the half turn in the node and store the checkpoint's values.
     """
-    with rejected_if_damaged(path, "is damaged, or no .glb that is read here", _REMEDY):
-        gltf, binary = _chunks(memoryview(data))
-        (mesh, primitive), *others = _find(gltf)
-        attributes = primitive["attributes"]
-        names = dict(_ATTRIBUTES)
-        dial = [name for name, stored in DIAL_ATTRIBUTES.items() if stored in attributes]
-        for name in dial_columns(dial):
-            names[name] = DIAL_ATTRIBUTES[name], 1
-        arrays = {
-            key: _values(gltf, binary, attributes[name], width)
-            for key, (name, width) in names.items()
-        }
-        coefficients = [
-            _values(gltf, binary, attributes[name], 3)
-            for name in harmonics(3)[1:]
-            if name in attributes
-        ]
-        if len(set(map(len, (*arrays.values(), *coefficients)))) > 1:
-            raise ValueError("its attributes are of different lengths")
-        text = gltf["asset"].get("extras", {}).get(KEY)
-        scale, turned, moved = _placed(gltf, mesh)
+    gltf, binary = _chunks(memoryview(data))
+    (mesh, primitive), *others = _find(gltf)
+    attributes = primitive["attributes"]
+    names = dict(_ATTRIBUTES)
+    dial = [name for name, stored in DIAL_ATTRIBUTES.items() if stored in attributes]
+    for name in dial_columns(dial):
+        names[name] = DIAL_ATTRIBUTES[name], 1
+    arrays = {
+        key: _values(gltf, binary, attributes[name], width) for key, (name, width) in names.items()
+    }
+    higher = [name for name in harmonics(3)[1:] if name in attributes]
+    arrays["shN"] = np.zeros((len(arrays["means"]), 0, 3), np.float32)
+    if higher:
+        coefficients = [_values(gltf, binary, attributes[name], 3) for name in higher]
+        arrays["shN"] = np.stack(coefficients, 1)
+    if len(set(map(len, arrays.values()))) > 1:
+        raise ValueError("its attributes are of different lengths")
     space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
     notes = []
     if space != COLOR_SPACE:
         notes.append(f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}")
     if others:
         notes.append(f"{len(others)} more primitives with Gaussians in it are left out")
+    text = gltf["asset"].get("extras", {}).get(KEY)
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
-    arrays["shN"] = np.zeros((len(arrays["means"]), 0, 3), np.float32)
-    if coefficients:
-        arrays["shN"] = np.stack(coefficients, 1)
     stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
+    scale, turned, moved = _placed(gltf, mesh)
     stored = stored if turned else half_turn(stored)
     if scale != 1:
         if SIGMA in arrays:
-            raise ClodError(f"{path}: its node scales a dial by {scale:g}; take the scale away")
+            raise ValueError(f"its node scales a dial by {scale:g}, which must be 1")
         stored["means"] = stored["means"] * np.float32(scale)
         stored["log_scales"] = stored["log_scales"] + np.float32(np.log(scale))
         notes.append(f"its node scales it by {scale:g}, which is applied")
@@ -328,21 +322,21 @@ def _stored(
     scales = arrays["log_scales"]
     opacities = arrays["opacity_logits"]
     notes = []
-    if re.fullmatch(_LOGARITHMS, generator) or _beyond(scales, np.inf):
+    if re.fullmatch(_LOGARITHMS, generator) or np.mean(scales < 0) > _STRAY:
         notes.append("its SCALE is not linear, as glTF has it, and is read as logarithms")
     else:
         if not generator.startswith(_LINEAR) and _may_be_logarithms(scales, arrays["means"]):
             notes.append(
                 "its SCALE is read as linear, as glTF has it, but may be logarithms: if its"
-                f" Gaussians look too small, {_REMEDY}"
+                " Gaussians look too small, export it again, as a .ply"
             )
         scales = values.logs_of(scales)
-    if _beyond(opacities, 1):
+    if np.mean((opacities < 0) | (opacities > 1)) > _STRAY:
         notes.append("its OPACITY is not within 0 and 1, as glTF has it, and is read as logits")
     else:
         opacities = np.maximum(values.logit(np.clip(opacities, 0, 1)), _FAINTEST)
-    stored = {"log_scales": scales, "opacity_logits": opacities, "sh0": arrays["sh0"][:, None]}
-    return {**arrays, **stored, "quats": np.roll(arrays["quats"], 1, axis=1)}, notes
+    arrays |= {"log_scales": scales, "opacity_logits": opacities, "sh0": arrays["sh0"][:, None]}
+    return arrays | {"quats": np.roll(arrays["quats"], 1, axis=1)}, notes
 
 
 def _may_be_logarithms(scales: np.ndarray, means: np.ndarray) -> bool:
@@ -355,9 +349,3 @@ def _may_be_logarithms(scales: np.ndarray, means: np.ndarray) -> bool:
     low, high = np.quantile(scales[finite], (0.05, 0.95))
     extent = np.ptp(means[finite].astype(np.float64), axis=0).max()
     return bool(high - low > 1 and high < np.log(max(extent, 1.0)))
-
-
-def _beyond(numbers: np.ndarray, most: float) -> bool:
-    """Whether numbers, and not just a few damaged ones, are below 0 or above ``most``."""
-    with np.errstate(invalid="ignore"):  # a NaN that signals
-        return bool(np.mean((numbers < 0) | (numbers > most)) > _STRAY)

@@ -36,7 +36,7 @@ from clod_adapter.equation.units import (
     known_distance,
     with_distance,
 )
-from clod_adapter.errors import ClodError, rejected_if_damaged
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ
@@ -68,7 +68,6 @@ QUANTISED = (
     "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
 )
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
-_CONVERT = "convert it: splat-transform IN.spz OUT.ply"
 _SMALL = 1 << 24  # bytes that any file may
 
 
@@ -189,33 +188,35 @@ def read(path: Path, data: bytes) -> Source:
     if data.startswith(NEW_SPZ):
         return splat_transform.read(path, data)
     packed = data
-    data = _unpacked(path, data)
+    limit = max(_SMALL, _BOMB * len(packed))
+    gzip = zlib.decompressobj(wbits=31)
+    data = gzip.decompress(packed, limit)
+    if not gzip.eof:
+        raise ValueError(f"it is truncated, or unpacks to more than {limit:,} bytes, as no splat")
     magic, version, count = struct.unpack_from("<III", data)
     degree, bits, flags = data[12:15]
     if magic == MAGIC and version == 2:
         return splat_transform.read(path, packed)
     readable = magic == MAGIC and version == VERSION
     if not readable or degree not in SH_COUNTS or bits > 24 or count > MOST_GAUSSIANS:
-        raise ClodError(
-            f"{path}: is no SPZ file of version 3 (version {version}, {count} Gaussians);"
-            f" {_CONVERT}"
-        )
+        raise ValueError(f"no SPZ file of version 3: version {version}, {count} Gaussians")
     bands = SH_COUNTS[degree] - 1
     sizes = 9, 1, 3, 3, 4, 3 * bands
     end = HEADER.size + count * sum(sizes)
     if not count or end > len(data):
-        raise ClodError(f"{path}: has no Gaussians or is truncated; copy or export it again")
+        raise ValueError("it has no Gaussians or is truncated")
     table = np.frombuffer(data[HEADER.size : end], np.uint8)
     ends = count * np.cumsum(sizes)[:-1]
     columns = [column.reshape(count, -1) for column in np.split(table, ends)]
     records = _records(data[end:]) if flags & EXTENDED else {}
-    stored, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
+    stored, dial = _ours(records[RECORD], count) if RECORD in records else (None, {})
     metadata = parse_metadata(path, stored, dial=bool(dial))
     # the axes; a file without a record has those that converters write
     axes = int.from_bytes(records.get(AXES, bytes([RDF])), "little")
     if axes != RDF:
         raise ClodError(
-            f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}"
+            f"{path}: its axes are of kind {axes}, which this reader does not know; convert it:"
+            " splat-transform IN.spz OUT.ply"
         )
     arrays = _unquantized(columns, bits) | dial
     if dial:  # whose sigma_d is in units of the reference distance where that is large
@@ -233,19 +234,6 @@ def read(path: Path, data: bytes) -> Source:
     return Source(arrays, metadata, (QUANTISED,), comments)
 
 
-def _unpacked(path: Path, data: bytes) -> bytes:
-    limit = max(_SMALL, _BOMB * len(data))
-    gzip = zlib.decompressobj(wbits=31)
-    with rejected_if_damaged(path):
-        unpacked = gzip.decompress(data, limit)
-    if not gzip.eof or len(unpacked) < HEADER.size:
-        raise ClodError(
-            f"{path}: is truncated, or unpacks to more than {limit:,} bytes, as no splat; export it"
-            " again"
-        )
-    return unpacked
-
-
 def _records(data: bytes) -> dict[int, bytes]:
     """The records after the arrays by their types, as far as they are whole."""
     records = {}
@@ -258,15 +246,15 @@ def _records(data: bytes) -> dict[int, bytes]:
     return records
 
 
-def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _ours(body: bytes, count: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The JSON document of our record, and the columns of the dial if they are there."""
-    with rejected_if_damaged(path, "its record of sigma_d is damaged"):
-        (length,) = struct.unpack_from("<I", body)
-        stored = json.loads(body[4 : 4 + length])
-        names = stored.get(COLUMNS, [SIGMA])
-        table = np.frombuffer(body[4 + length :], "<f2").astype(np.float32).reshape(-1, count)
-        if len(table) and (len(table) != len(names) or list(dial_columns(names)) != names):
-            raise ValueError(f"{len(table)} columns of {names!r:.40}")
+    (length,) = struct.unpack_from("<I", body)
+    stored = json.loads(body[4 : 4 + length])
+    names = stored.get(COLUMNS, [SIGMA])
+    table = np.frombuffer(body[4 + length :], "<f2").astype(np.float32).reshape(-1, count)
+    known = isinstance(names, list) and names == list(dial_columns(names))
+    if not known or len(table) not in (0, len(names)):
+        raise ValueError(f"its record of sigma_d is damaged: {len(table)} of {names!r:.40}")
     return stored, dict(zip(names, table, strict=False))  # no rows without a dial
 
 
