@@ -11,7 +11,6 @@ import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -76,14 +75,14 @@ def format_of(path: Path) -> Format:
 
 def check_readable(path: Path) -> None:
     """Rejects, without torch, a file whose first bytes are not of its format."""
-    _call(format_of(path).check, path)
+    _reading(format_of(path).check, path)
 
 
 def file_has_dial(path: Path) -> bool:
     """Whether the file has a sigma_d: of a PLY by its header, other formats are read."""
     form = format_of(path)
     if form is PLY:
-        return bool(_call("ply.has_dial", path))
+        return bool(_reading("ply.has_dial", path))
     if form.carries_sigma:
         return read_source(path).metadata.attenuation is not None
     check_readable(path)
@@ -121,8 +120,7 @@ def read_source(path: Path) -> Source:
 def _read(path: Path) -> Source:
     check_readable(path)
     data = read_bytes(path)  # once, and not mapped: another program may write the file meanwhile
-    with rejected_if_damaged(path):
-        source: Source = _call(f"{format_of(path).module}.read", path, data)
+    source: Source = _reading(f"{format_of(path).module}.read", path, data)
     return source._replace(sha256=hashlib.sha256(data).hexdigest())
 
 
@@ -151,9 +149,9 @@ def write(
     stored = replace(
         metadata or Metadata(), attenuation=g.attenuation, screen_filter=g.screen_filter
     )
-    writer = writer or partial(_call, f"{form.module}.write")
+    written = writer or import_module(f"clod_adapter.io.{form.module}").write
     with atomic_path(path) as temporary:
-        notes = writer(temporary, g, stored)
+        notes: tuple[str, ...] = written(temporary, g, stored)
         try:
             file_has_dial(temporary)
         except ClodError as error:
@@ -173,16 +171,17 @@ def check_start(path: Path) -> None:
     """Rejects a file whose first bytes are not of its suffix's format."""
     suffix = path.suffix.lower()
     start = read_bytes(path, START)
-    reject_known(path, start)
-    if suffix in _START and not start.startswith(_START[suffix]):
+    if not start.startswith(_START[suffix]):
         reject(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
-    if suffix == ".spz" and start.startswith(NEW_SPZ):
-        _call("formats.splat_transform.check", path)
+    if start.startswith(NEW_SPZ):
+        _reading("formats.splat_transform.check", path)
 
 
-def _call(function: str, *args: Any) -> Any:
+def _reading(function: str, path: Path, *args: Any) -> Any:
+    """Calls a format's function; any error in it becomes one that names the file."""
     module, name = function.rsplit(".", 1)
-    return getattr(import_module(f"clod_adapter.io.{module}"), name)(*args)
+    with rejected_if_damaged(path):
+        return getattr(import_module(f"clod_adapter.io.{module}"), name)(path, *args)
 
 
 _CONVERT = (

@@ -65,11 +65,7 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
         )
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
     if end is None:
-        most = f" in its first {HEADER_LIMIT:,} bytes" if len(start) >= HEADER_LIMIT else ""
-        raise ClodError(
-            f"{path}: the PLY header has no end{most}, so the file is truncated; copy or export it"
-            " again"
-        )
+        raise ValueError(f"the PLY header has no end in its first {len(start):,} bytes")
     text = re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]+", _in_ascii, start[: end.end()])
     notes: tuple[str, ...] = ()
     if re.search(_PREFIXED + rb"scale_0\b", text) and b" scale_0" not in text:
@@ -77,18 +73,13 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
         notes = (UNPREFIXED,)
     header = re.sub(rb"\r\n?", b"\n", text)
     if re.search(rb"[^\t\n\x20-\x7e]", header):
-        raise ClodError(
-            f"{path}: the PLY header has a name that is not printable ASCII; export the file again"
-        )
+        raise ValueError("the PLY header has a name that is not printable ASCII")
     counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,20})[ \t]*$", header)
     header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,20}[ \t]*$", rb"\g<1>0", header)
-    with rejected_if_damaged(path, "the PLY header is damaged", "export the file again"):
+    with rejected_if_damaged(path, "the PLY header is damaged"):
         ply = PlyData.read(io.BytesIO(header), mmap=False)
-    if len(counts) != len(ply.elements):
-        raise ClodError(
-            f"{path}: the PLY header is damaged (a row count is not a number); export the file"
-            " again"
-        )
+        if len(counts) != len(ply.elements):
+            raise ValueError("a row count is not a number")
     elements = tuple(zip(ply, map(int, counts), strict=True))
     comments = tuple(chain(ply.comments, *(element.comments for element in ply)))
     return Head(ply, elements, text, end.end(), comments, notes)
@@ -104,7 +95,7 @@ def has_dial(path: Path) -> bool:
     """
     head = read_head(path)
     sh_degree_of(path, head.ply)
-    _check_length(path, head, path.stat().st_size)
+    _check_length(head, path.stat().st_size)
     dial = SIGMA in {column.name for column in head.ply["vertex"].properties}
     ply_metadata(path, head.comments, dial=dial)
     return dial
@@ -114,7 +105,7 @@ def read(path: Path, data: bytes) -> Source:
     """Reads a PLY; nothing is allocated for rows that its length does not have."""
     head = read_head(path, data)
     degree = sh_degree_of(path, head.ply)
-    _check_length(path, head, len(data))
+    _check_length(head, len(data))
     rows = _vertices(data, head)
     notes = [*head.notes, *of_another_method(rows.dtype.names or ())]
     arrays = _arrays(rows, degree)
@@ -175,7 +166,7 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     return arrays
 
 
-def _check_length(path: Path, head: Head, length: int) -> None:
+def _check_length(head: Head, length: int) -> None:
     """Rejects a file that is too short for the least bytes that the rows of its header take."""
     text = head.ply.text
     least = head.size - text
@@ -190,9 +181,8 @@ def _check_length(path: Path, head: Head, length: int) -> None:
             least += count * np.dtype(kind).itemsize
     if least > length:
         rows = ", ".join(f"{count} of {element.name}" for element, count in head.elements)
-        raise ClodError(
-            f"{path}: is truncated or damaged: its header claims {rows}, {least} bytes or more, and"
-            f" the file has {length}; copy or export it again"
+        raise ValueError(
+            f"it is truncated: its header claims {rows}, {least} bytes, and the file has {length}"
         )
 
 

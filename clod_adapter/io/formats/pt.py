@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clod_adapter.errors import ClodError, rejected_if_damaged
+from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import KEY, START, read_bytes, reject
 from clod_adapter.io.settings import (
     MODEL,
@@ -60,15 +60,13 @@ def check(path: Path) -> None:
         )
     if not start.startswith(b"PK"):
         reject(path, start, "is no file of torch.save; export the checkpoint as a PLY")
-    with rejected_if_damaged(path), zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
         pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
         stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
         fits = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
         if not fits or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
-            raise ClodError(
-                f"{path}: is a zip archive that torch.save does not write; export a PLY instead"
-            )
+            raise ValueError("it is a zip archive that torch.save does not write")
         # A pickle that names anything but what plain tensors need: ``weights_only`` runs no code
         # either, but lets a hundred bytes of it ask for gigabytes.
         with warnings.catch_warnings():
@@ -76,9 +74,8 @@ def check(path: Path) -> None:
             for opcode, argument, _ in pickletools.genops(archive.read(pickles[0])):
                 named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
                 if named and not re.fullmatch(_PLAIN, str(argument)):
-                    raise ClodError(
-                        f"{path}: holds {argument}, more than tensors, and is not unpickled; export"
-                        " a PLY"
+                    raise ValueError(
+                        f"it holds {argument}, more than tensors, and is not unpickled"
                     )
 
 
@@ -90,12 +87,7 @@ def read(path: Path, data: bytes) -> Source:
 
     from clod_adapter.integrations.splats import NAMES
 
-    with (
-        rejected_if_damaged(
-            path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY"
-        ),
-        warnings.catch_warnings(),
-    ):
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         checkpoint = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     content = type(checkpoint).__name__
@@ -104,14 +96,11 @@ def read(path: Path, data: bytes) -> Source:
         content = ", ".join(map(repr, list(checkpoint)[:5]))
         splats = checkpoint.get("splats")
     if not isinstance(splats, dict):
-        raise ClodError(
-            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {content});"
-            " export a PLY"
-        )
+        raise ValueError(f"it has no dictionary 'splats' of gsplat's trainer, but {content}")
     names = (*NAMES, *dial_columns(splats))
     arrays = {}
     for name in names:
-        arrays[NAMES.get(name, name)] = _values(path, name, splats, len(data))
+        arrays[NAMES.get(name, name)] = _values(name, splats, len(data))
     metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)
     notes = [] if metadata.described else [FRAME]
     for name, (correction, remedy) in _CORRECTIONS.items():
@@ -124,7 +113,7 @@ def read(path: Path, data: bytes) -> Source:
     return Source(arrays, metadata, tuple(notes), metadata.about, not metadata.described)
 
 
-def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndarray:
+def _values(name: str, splats: dict[str, Any], size: int) -> np.ndarray:
     """A parameter as float32, unless it is none or claims more values than the file's ``size`` in
     bytes.
     """
@@ -132,24 +121,17 @@ def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndar
 
     value = splats.get(name)
     if value is None:
-        hint = (
-            "; with appearance optimisation its trainer stores no colours"
-            if "features" in splats
-            else ""
+        hint = "; with appearance optimisation its trainer stores no colours" * (
+            "features" in splats
         )
-        raise ClodError(
-            f"{path}: splats has no {name!r}{hint}; export it as a PLY with spherical harmonics"
-        )
+        raise ValueError(f"splats has no {name!r}{hint}")
     usable = (
         isinstance(value, torch.Tensor)
         and value.device.type == "cpu"
         and value.layout == torch.strided
     )
     if not usable or not value.is_floating_point() or value.nbytes > size:
-        raise ClodError(
-            f"{path}: splats[{name!r}] is no plain tensor of numbers; export the checkpoint as"
-            " a PLY"
-        )
+        raise ValueError(f"splats[{name!r}] is no plain tensor of numbers")
     return value.detach().float().numpy()
 
 

@@ -51,30 +51,24 @@ def find_cameras(folder: Path) -> Path:
     there; nerfstudio's colmap/sparse/0, and colmap/0; COLMAP's dense/sparse; Inria's
     distorted/sparse/0; and a model in sparse beside ``folder``, which may be the images' own.
     """
-    candidates = [
-        *models_in(folder / "sparse"),
-        *models_in(folder),
-        *(folder / name for name in TRANSFORMS if (folder / name).is_file()),
-        *models_in(folder / "colmap" / "sparse"),
-        *models_in(folder / "colmap"),
-        *models_in(folder / "dense" / "sparse"),
-        *models_in(folder / "distorted" / "sparse"),
-        *models_in(folder.resolve().parent / "sparse"),
-    ]
-    if not candidates:
-        raise ClodError(
-            f"{folder}: no COLMAP model (cameras, images; .bin or .txt) in it, sparse or sparse/0,"
-            " and no transforms.json; give the folder that holds images/ and sparse/0, or"
-            " transforms.json"
-        )
-    return candidates[0]
+    others = ("colmap/sparse", "colmap", "dense/sparse", "distorted/sparse")
+    for name in ("sparse", "", *TRANSFORMS, *others, folder.resolve().parent / "sparse"):
+        place = folder / name
+        if place.is_file():
+            return place
+        if models := models_in(place):
+            return models[0]
+    raise ClodError(
+        f"{folder}: no COLMAP model (cameras, images; .bin or .txt) in it, sparse or sparse/0, and"
+        " no transforms.json; give the folder that holds images/ and sparse/0, or transforms.json"
+    )
 
 
 def models_in(folder: Path) -> list[Path]:
     """COLMAP's models in the numbered folders of this one, by number, and in itself."""
     numbered = [path for path in folder.glob("*") if path.name.isdecimal()]
-    numbered.sort(key=lambda path: int(path.name))
-    return [path for path in (*numbered, folder) if form_of(path)]
+    folders = [*sorted(numbered, key=lambda path: int(path.name)), folder]
+    return [path for path in folders if form_of(path)]
 
 
 def form_of(folder: Path) -> str:

@@ -1,7 +1,7 @@
 """Reads posed photographs, or their cameras alone, from a COLMAP model or a transforms file."""
 
 import warnings
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from functools import partial
@@ -120,17 +120,13 @@ def load_cameras(
     folder = Path(folder)
     source, images, notes = _posed(folder)
     testing = held_out(images, TEST_EVERY) if training else set()
-    sized = [
-        image.relative_to(origin)
-        for image in images
-        if min(image.camera.width, image.camera.height) > 1
-    ]
-    cameras = [
-        _pinhole(image, image.camera.calibration_matrix(), image.camera.width, image.camera.height)
-        for image in sized
-    ]
-    if len(cameras) < len(images):
-        unsized = len(images) - len(cameras)
+    cameras = []
+    for image in images:
+        lens = image.camera
+        if min(lens.width, lens.height) > 1:
+            posed = image.relative_to(origin)
+            cameras.append(_pinhole(posed, lens.calibration_matrix(), lens.width, lens.height))
+    if unsized := len(images) - len(cameras):
         notes.append(
             f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph"
             " has a size"
@@ -189,13 +185,14 @@ def _load(loads: Sequence[Load], progress: Listener | None) -> tuple[list[View],
 
 def _summary(notes: Sequence[Note], total: int) -> list[str]:
     """One line for each thing done, however many sizes it was done to."""
+    details = defaultdict[str, list[str]](list)
+    for change, detail in notes:
+        details[change].append(detail)
     lines = []
-    for change, count in Counter(change for change, _ in notes).items():
-        details = list(
-            dict.fromkeys(detail for other_change, detail in notes if other_change == change)
-        )
-        others = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-        lines.append(f"{count} of {total} images {change.format(details[0] + others)}")
+    for change, those in details.items():
+        kinds = len(set(those))
+        others = f" (and {kinds - 1} more)" if kinds > 1 else ""
+        lines.append(f"{len(those)} of {total} images {change.format(those[0] + others)}")
     return lines
 
 
