@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from clod_adapter._support.text import as_text
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.io.file_formats import read_bytes, reject_long_numbers
-from clod_adapter.io.scene.folder import find_cameras, form_of, name_parts
+from clod_adapter.io.scene.folder import find_cameras, form_of, plain_name
 from clod_adapter.origin import NOWHERE
 
 try:
@@ -147,7 +147,7 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
         stated = re.search(rb"^# *Number of images: *(\d+)", read_bytes(path, START), re.MULTILINE)
     posed = []
     for name, quat, translation, camera in records:
-        name_parts(name, path)
+        plain_name(name, path)
         if camera not in cameras:
             raise ClodError(
                 f"{path}: image {name!r} has camera {camera}, which is not in cameras{form}; export"

@@ -6,6 +6,7 @@ Needs neither pycolmap nor torch, so that a wrong folder is rejected before they
 
 import json
 import os
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from itertools import product
@@ -109,11 +110,11 @@ def find_photographs(
 
     All are from the one of ``_roots`` that has most of them.
     """
-    split_names = [name_parts(name, cameras) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
     roots = _roots(folder, cameras, raw)
-    candidates = [(*find_files(root, split_names), root) for root in roots]
+    plain_names = [plain_name(name, cameras) for name in names]
+    candidates = [(*find_files(root, plain_names), root) for root in roots]
     paths, others, root = min(candidates, key=lambda files: (files[0].count(None), len(files[1])))
     notes = []
     if others:
@@ -129,11 +130,7 @@ def find_photographs(
         for masks in sorted(beside.glob(MASKS)):
             if any(masks.glob("*")):
                 notes.append(f"the masks in {masks} are {UNUSED}")
-    missing = [
-        as_text(str(Path(*name)))
-        for name, path in zip(split_names, paths, strict=True)
-        if path is None
-    ]
+    missing = [name for name, path in zip(plain_names, paths, strict=True) if path is None]
     if missing:
         examples = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
         if root.is_dir() and not os.access(root, os.X_OK):
@@ -149,30 +146,31 @@ def find_photographs(
     return paths, notes
 
 
-def find_files(
-    root: Path, split_names: Sequence[tuple[str, ...]]
-) -> tuple[list[Path | None], list[Path]]:
+def find_files(root: Path, names: Sequence[str]) -> tuple[list[Path | None], list[Path]]:
     """The files of these names, and which of them have another suffix or case.
 
     In place of a missing one that is the only photograph of the same name otherwise, if no other
     name stands for it.
     """
-    expected = [root.joinpath(*map(file_name, name)) for name in split_names]
-    missing = [path for path in expected if not isfile(path)]
+    expected = [root / file_name(name) for name in names]
+    count = Counter(map(_without_suffix, expected))
     photographs = defaultdict[Path, list[Path]](list)
-    for folder in {path.parent for path in missing}:
+    for folder in {path.parent for path in expected if not isfile(path)}:
         for path in folder.glob("*"):
             if path.suffix.lower() in PHOTOGRAPHS:
                 photographs[_without_suffix(path)].append(path)
-    count = Counter(map(_without_suffix, expected))
-    files: dict[Path, Path | None] = dict.fromkeys(missing)
+    files: list[Path | None] = []
     others = []
-    for path in files:
+    for path in expected:
         key = _without_suffix(path)
-        if len(photographs[key]) == count[key] == 1:
-            files[path] = photographs[key][0]
+        if isfile(path):
+            files.append(path)
+        elif len(photographs[key]) == count[key] == 1:
+            files += photographs[key]
             others += photographs[key]
-    return [files.get(path, path) for path in expected], others
+        else:
+            files.append(None)
+    return files, others
 
 
 def _without_suffix(path: Path) -> Path:
@@ -180,9 +178,9 @@ def _without_suffix(path: Path) -> Path:
     return path.with_name(normalize("NFC", path.stem).casefold())
 
 
-def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str, ...]:
-    """The parts of a photograph's name, split at / and at the \\ of files made on Windows; rejects
-    what is no name.
+def plain_name(name: str, cameras: Path, home: Path | None = None) -> str:
+    """A photograph's name as a relative path with /, also of files made on Windows; rejects what is
+    no name.
 
     Where the path leads out of ``home`` it is the longest end that is a file there, with one of
     ENDINGS.
@@ -194,18 +192,18 @@ def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str,
         )
     path = PureWindowsPath(name)
     longest = max((len(component.encode()) for component in path.parts), default=0)
-    control = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
+    control = re.search(r"[\x00-\x1f\x7f-\x9f]", name)
     if control or len(name) > LONGEST_NAME or longest > LONGEST_PART:
         raise ClodError(
             f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name;"
             " rename it"
         )
     if path.parts and not leaves(name):
-        return path.parts
+        return path.as_posix()
     if home is not None:
         for count in range(min(MOST_PARTS, len(path.parts) - 1), 0, -1):
-            end = path.parts[-count:]
-            if ".." not in end and with_ending(home, "/".join(end)):
+            end = "/".join(path.parts[-count:])
+            if not leaves(end) and with_ending(home, end):
                 return end
     raise ClodError(
         f"{cameras}: image name {name[:80]!r} leaves the images folder or is no name; put the"

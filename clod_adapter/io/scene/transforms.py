@@ -22,7 +22,7 @@ from clod_adapter.io.scene.folder import (
     UNUSED,
     find_files,
     leaves,
-    name_parts,
+    plain_name,
     read_json,
     with_ending,
 )
@@ -78,13 +78,13 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
         raise ClodError(
             f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json"
         )
-    paths = []
+    names = []
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
-        paths.append("/".join(name_parts(frame["file_path"], path, path.parent)))
-    names = [with_ending(path.parent, name) or name for name in paths]
-    files, _ = find_files(path.parent, [tuple(name.split("/")) for name in names])
+        name = plain_name(frame["file_path"], path, path.parent)
+        names.append(with_ending(path.parent, name) or name)
+    files, _ = find_files(path.parent, names)
     images = []
     for frame, name, file in zip(frames, names, files, strict=True):
         where = f"{path}: frame {name}"
