@@ -144,7 +144,10 @@ def _replace(targets: Sequence[Path], temporaries: Sequence[Path]) -> None:
     earlier = {target: _temporary(target) for target in targets[:-1] if target.exists()}
     try:
         for target, backup in earlier.items():
-            _keep(target, backup)
+            try:
+                os.link(target, backup)
+            except OSError:  # a file system without links
+                shutil.copy2(target, backup)
         # One call from C, so that no Ctrl-C comes between two of them.
         list(map(os.replace, list(map(str, temporaries)), list(map(str, targets))))
     except OSError:
@@ -157,14 +160,6 @@ def _replace(targets: Sequence[Path], temporaries: Sequence[Path]) -> None:
     finally:
         for backup in earlier.values():
             _remove(backup)
-
-
-def _keep(target: Path, backup: Path) -> None:
-    """Gives the file a second name, or where the file system has no links, a copy."""
-    try:
-        os.link(target, backup)
-    except OSError:
-        shutil.copy2(target, backup)
 
 
 def _flush(path: Path) -> None:

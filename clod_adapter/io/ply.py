@@ -66,7 +66,11 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
     if end is None:
         raise ValueError(f"the PLY header has no end in its first {len(start):,} bytes")
-    text = re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]+", _in_ascii, start[: end.end()])
+
+    def in_ascii(line: re.Match[bytes]) -> bytes:
+        return re.sub(rb"[^\t\x20-\x7e]", b"?", line[0])
+
+    text = re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]+", in_ascii, start[: end.end()])
     notes: tuple[str, ...] = ()
     if re.search(_PREFIXED + rb"scale_0\b", text) and b" scale_0" not in text:
         text = re.sub(_PREFIXED, rb"\g<1>", text)
@@ -83,10 +87,6 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
     elements = tuple(zip(ply, map(int, counts), strict=True))
     comments = tuple(chain(ply.comments, *(element.comments for element in ply)))
     return Head(ply, elements, text, end.end(), comments, notes)
-
-
-def _in_ascii(line: re.Match[bytes]) -> bytes:
-    return re.sub(rb"[^\t\x20-\x7e]", b"?", line[0])
 
 
 def has_dial(path: Path) -> bool:

@@ -29,7 +29,6 @@ from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, dial_colum
 from clod_adapter.origin import NOWHERE, Origin, origin_of
 
 EXTENSION = "KHR_gaussian_splatting"
-DIAL_ATTRIBUTES = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D", OPACITY: "_OPACITY_D"}
 COLOR_SPACE = "srgb_rec709_display"
 _FLOAT = 5126
 _BYTE = 5121
@@ -51,12 +50,13 @@ _BIN = 0x004E4942
 # stands for 1, and these.
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+DIAL_ATTRIBUTES = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D", OPACITY: "_OPACITY_D"}
 _ATTRIBUTES = {
-    "means": ("POSITION", 3),
-    "quats": (f"{EXTENSION}:ROTATION", 4),
-    "log_scales": (f"{EXTENSION}:SCALE", 3),
-    "opacity_logits": (f"{EXTENSION}:OPACITY", 1),
-    "sh0": (harmonics(0)[0], 3),
+    "means": "POSITION",
+    "quats": f"{EXTENSION}:ROTATION",
+    "log_scales": f"{EXTENSION}:SCALE",
+    "opacity_logits": f"{EXTENSION}:OPACITY",
+    "sh0": harmonics(0)[0],
 }
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 # a program that wrote SCALE so, whatever its range
@@ -172,18 +172,16 @@ def read(path: Path, data: bytes) -> Source:
     gltf, binary = _chunks(memoryview(data))
     (mesh, primitive), *others = _find(gltf)
     attributes = primitive["attributes"]
-    names = dict(_ATTRIBUTES)
-    dial = [name for name, stored in DIAL_ATTRIBUTES.items() if stored in attributes]
+    stored = {}
+    for name in (*_ATTRIBUTES.values(), *DIAL_ATTRIBUTES.values(), *harmonics(3)):
+        if name in attributes:
+            stored[name] = _values(gltf, binary, attributes[name])
+    arrays = {name: stored[attribute] for name, attribute in _ATTRIBUTES.items()}
+    dial = [name for name, attribute in DIAL_ATTRIBUTES.items() if attribute in stored]
     for name in dial_columns(dial):
-        names[name] = DIAL_ATTRIBUTES[name], 1
-    arrays = {
-        key: _values(gltf, binary, attributes[name], width) for key, (name, width) in names.items()
-    }
-    higher = [name for name in harmonics(3)[1:] if name in attributes]
-    arrays["shN"] = np.zeros((len(arrays["means"]), 0, 3), np.float32)
-    if higher:
-        coefficients = [_values(gltf, binary, attributes[name], 3) for name in higher]
-        arrays["shN"] = np.stack(coefficients, 1)
+        arrays[name] = stored[DIAL_ATTRIBUTES[name]]
+    coefficients = [stored[name] for name in harmonics(3) if name in stored]
+    arrays["shN"] = np.stack(coefficients, 1)[:, 1:]
     if len(set(map(len, arrays.values()))) > 1:
         raise ValueError("its attributes are of different lengths")
     space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
@@ -194,23 +192,24 @@ def read(path: Path, data: bytes) -> Source:
         notes.append(f"{len(others)} more primitives with Gaussians in it are left out")
     text = gltf["asset"].get("extras", {}).get(KEY)
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
-    stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
+    arrays, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
     scale, turned, moved = _placed(gltf, mesh)
-    stored = stored if turned else half_turn(stored)
+    if not turned:
+        arrays = half_turn(arrays)
     if scale != 1:
         if SIGMA in arrays:
             raise ValueError(f"its node scales a dial by {scale:g}, which must be 1")
-        stored["means"] = stored["means"] * np.float32(scale)
-        stored["log_scales"] = stored["log_scales"] + np.float32(np.log(scale))
+        arrays["means"] = arrays["means"] * np.float32(scale)
+        arrays["log_scales"] = arrays["log_scales"] + np.float32(np.log(scale))
         notes.append(f"its node scales it by {scale:g}, which is applied")
     if moved != metadata.origin:  # another program moved the node
-        world_means = stored["means"].astype(np.float64) + moved
+        world_means = arrays["means"].astype(np.float64) + moved
         if not any(origin_of(world_means)):  # float32 has enough digits
-            stored["means"] = world_means
+            arrays["means"] = world_means
             moved = NOWHERE
         metadata = replace(metadata, origin=moved)
-    return Source(stored, metadata, tuple(notes), metadata.about)
+    return Source(arrays, metadata, tuple(notes), metadata.about)
 
 
 def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
@@ -232,16 +231,17 @@ def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
         raise ValueError(f"it has no Gaussians, {EXTENSION}, so it is a mesh")
     first = primitives[0][1]
     compressed = first["extensions"][EXTENSION].get("extensions")
-    if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
+    if compressed or any(name not in first["attributes"] for name in _ATTRIBUTES.values()):
         raise ValueError("its Gaussians are compressed, or have no spherical harmonics")
     return primitives
 
 
-def _values(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> np.ndarray:
+def _values(gltf: dict[str, Any], binary: memoryview, number: int) -> np.ndarray:
     """``[N, width]`` float32, the values of an accessor; ``[N]`` where the width is 1."""
     accessor = gltf["accessors"][_count(number)]
-    if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
-        raise ValueError(f"an attribute is sparse or of type {accessor['type']!r:.20}")
+    if "sparse" in accessor:
+        raise ValueError("an attribute is sparse")
+    width = _WIDTHS[accessor["type"]]
     kind = np.dtype(_KINDS[accessor["componentType"]])
     view = gltf["bufferViews"][_count(accessor["bufferView"])]
     if _count(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PureWindowsPath
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,6 +40,9 @@ SPLIT = "test.txt"
 HUGE = 1e9  # world units and pixels; larger values are damage, and may not fit float32
 
 
+Image = tuple[str, list[float], int]  # as a model's file has it
+
+
 @dataclass(frozen=True)
 class PosedImage:
     """A photograph's name, pose and camera."""
@@ -62,15 +65,6 @@ class PosedImage:
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] += viewmat[:3, :3] @ np.asarray(origin, np.float64)
         return replace(self, viewmat=viewmat)
-
-
-class Image(NamedTuple):
-    """An image as a model's file has it."""
-
-    name: str
-    quat: Sequence[float]  # w first, of any length; world to camera
-    translation: Sequence[float]
-    camera: int  # its number
 
 
 def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
@@ -146,7 +140,7 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
         records = sorted((_images if form == ".bin" else _images_in_text)(path))
         stated = re.search(rb"^# *Number of images: *(\d+)", read_bytes(path, START), re.MULTILINE)
     posed = []
-    for name, quat, translation, camera in records:
+    for name, pose, camera in records:
         plain_name(name, path)
         if camera not in cameras:
             raise ClodError(
@@ -156,8 +150,8 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
         viewmat = np.eye(4)
         with rejected_if_damaged(path, f"image {name!r} has no rotation"):
             # of any length; scipy has w last
-            viewmat[:3, :3] = Rotation.from_quat(np.roll(quat, -1)).as_matrix()
-        viewmat[:3, 3] = translation
+            viewmat[:3, :3] = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
+        viewmat[:3, 3] = pose[4:]
         posed.append(check_posed(PosedImage(name, viewmat, cameras[camera]), model))
     if not posed:
         raise ClodError(f"{model}: the model has no registered image; run COLMAP's mapper again")
@@ -240,10 +234,11 @@ def _camera_records(path: Path) -> Iterator[pycolmap.Camera]:
 
 
 def _images(path: Path) -> Iterator[Image]:
+    """Name, quaternion and translation from world to camera, and number of the camera."""
     records = _Records(path)
     for _ in records.each():
         _, *pose, camera = records.take("I7dI")
-        yield Image(records.take_name(), pose[:4], pose[4:], camera)
+        yield records.take_name(), pose, camera
         records.skip(24 * records.take("Q")[0])  # keypoints
 
 
@@ -289,9 +284,7 @@ def _images_in_text(path: Path) -> Iterator[Image]:
                 f"line {number} is neither an image with its camera and name nor keypoints of one"
             )
         pose = list(map(float, fields[1:8]))
-        yield Image(
-            fields[9].decode("utf-8", "surrogateescape"), pose[:4], pose[4:], int(fields[8])
-        )
+        yield fields[9].decode("utf-8", "surrogateescape"), pose, int(fields[8])
         may_be_keypoints = True
 
 
