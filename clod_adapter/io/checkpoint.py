@@ -159,7 +159,8 @@ def load(
     rows = source.rows
     if not values.keep.all():
         arrays = {name: array[values.keep] for name, array in arrays.items()}
-        rows = None if rows is None else rows[values.keep]
+        if rows is not None:
+            rows = rows[values.keep]
     screen_filter = stated_filter(source)
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     gaussians = Gaussians(

@@ -161,7 +161,7 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     for name in ("opacity_logits", SIGMA, GROWTH, OPACITY):
         if name in arrays:
             arrays[name] = arrays[name][:, 0]
-    arrays["sh0"] = arrays["sh0"][:, None]
+    arrays["sh0"] = arrays["sh0"].reshape(-1, 1, 3)
     arrays["shN"] = arrays["shN"].reshape(len(rows), len(groups["shN"]) // 3, 3)
     return arrays
 

@@ -343,9 +343,6 @@ def _may_be_logarithms(scales: np.ndarray, means: np.ndarray) -> bool:
     """Whether positive scales would, as logarithms, be of unequal sizes within the scene; those of
     most linear ones are equal, or far larger.
     """
-    finite = np.isfinite(scales).all(1) & np.isfinite(means).all(1)
-    if not finite.any():
-        return False
-    low, high = np.quantile(scales[finite], (0.05, 0.95))
-    extent = np.ptp(means[finite].astype(np.float64), axis=0).max()
+    low, high = np.nanquantile(scales, (0.05, 0.95))
+    extent = (np.nanmax(means, 0) - np.nanmin(means, 0)).max()
     return bool(high - low > 1 and high < np.log(max(extent, 1.0)))
