@@ -15,7 +15,6 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY, START, read_bytes, reject_known
 from clod_adapter.io.settings import (
     ADAPTER,
-    DAMAGED,
     Metadata,
     document,
     parse_document,
@@ -62,20 +61,19 @@ def load_adapter(path: str | Path) -> Adapter:
     """
     path = Path(path)
     reject_known(path, read_bytes(path, START))
-    with rejected_if_damaged(path, "is not a safetensors file, or damaged"):
+    with rejected_if_damaged(path, "is no adapter, or its tensors or settings are damaged"):
         tensors, metadata = read_tensors(path)
-    if KEY not in metadata:
-        raise ClodError(
-            f"{path}: is a safetensors file but not an adapter; give a file that this package wrote"
-        )
-    about = parse_document(path, metadata[KEY], ADAPTER)
-    with rejected_if_damaged(path, *DAMAGED):
+        if KEY not in metadata:
+            raise ClodError(
+                f"{path}: is a safetensors file but not an adapter; give a file that this package"
+                " wrote"
+            )
+        about = parse_document(path, metadata[KEY], ADAPTER)
         for name, kind in (("base_sha256", str), ("config", dict)):
             if not isinstance(about[name], kind):
                 raise TypeError(f"{name} is {about[name]!r:.40}, not a {kind.__name__}")
-    settings = read_metadata(path, about, dial=True)
-    assert settings.attenuation is not None
-    with rejected_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
+        settings = read_metadata(path, about, dial=True)
+        assert settings.attenuation is not None
         names = [name for name in tensors if name.startswith(ADDED)]
         added = {name.removeprefix(ADDED): tensors.pop(name) for name in names}
         return Adapter(

@@ -95,9 +95,6 @@ def read_metadata(
     """
     notes: list[str] = []
     with rejected_if_damaged(path, *DAMAGED):
-        version = values.get("package_version", "")
-        if not isinstance(version, str):
-            raise TypeError(f"package_version is {version!r:.40}, not a string")
         return Metadata(
             attenuation=(
                 _attenuation(path, values.get("attenuation", {}), described, notes)
@@ -108,7 +105,7 @@ def read_metadata(
             calibration=_calibration(values.get("calibration"), notes),
             origin=parse_origin(values.get("origin", NOWHERE)),
             about=tuple(map(str, values.get("about", ()))),
-            version=version,
+            version=str(values.get("package_version", "")),
             described=described,
             notes=tuple(notes),
         )

@@ -105,26 +105,23 @@ def prepared(
         MASKS: (2,),
         FILTER_3D: (1,),
     }
+    values: Arrays = {}
     for name, array in arrays.items():
         shape = (*count, *shapes.get(name, ()))
         if array.shape != shape:
             raise ClodError(
                 f"{path}: {name} has shape {array.shape}, expected {shape}; export it again"
             )
+        values[name] = array if name == "means" else np.ascontiguousarray(array, np.float32)
     if coefficients[0] + 1 not in SH_COUNTS.values():
         raise ClodError(
             f"{path}: shN has {coefficients[0]} coefficients, which fit no SH degree; export it"
             " again"
         )
-    if OPACITY in arrays:
-        arrays = dict(arrays)
-        far_logits = arrays.pop(OPACITY)
-        arrays["opacity_logits"] = np.where(arrays[SIGMA] > 0, far_logits, arrays["opacity_logits"])
-    stored = {
-        name: array if name == "means" else np.ascontiguousarray(array, np.float32)
-        for name, array in arrays.items()
-    }
-    values, was, changes = _as_logits(path, stored, activated)
+    if OPACITY in values:
+        far_logits = values.pop(OPACITY)
+        values["opacity_logits"] = np.where(values[SIGMA] > 0, far_logits, values["opacity_logits"])
+    was, changes = _as_logits(path, values, activated)
     if origin is None:
         origin = at if any(at) else origin_of(values["means"])
     values["means"] = np.ascontiguousarray(relative(values["means"], at, origin))
@@ -140,9 +137,9 @@ def prepared(
 
 def _as_logits(
     path: Path, arrays: Arrays, activated: Activated | None
-) -> tuple[Arrays, Activated, list[str]]:
-    """Logit opacities, logarithmic scales and no ``filter_3D``; what was activated; a line for each
-    change.
+) -> tuple[Activated, list[str]]:
+    """Turns arrays into logit opacities, logarithmic scales and no ``filter_3D``; what was
+    activated, and a line for each change.
     """
     choices = get_args(Activated)
     require(
@@ -175,7 +172,7 @@ def _as_logits(
         notes.append(
             "Mip-Splatting's filter_3D is fused into scale and opacity, and left out of outputs"
         )
-    return arrays, choice_of(activated_names), notes
+    return choice_of(activated_names), notes
 
 
 def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:

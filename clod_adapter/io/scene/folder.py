@@ -33,16 +33,11 @@ RAW = "input"  # Inria's name for the photographs before they are undistorted in
 NAMES = ("images", *SMALLER, RAW)  # of folders of photographs, the likeliest first
 # of the photographs of models in these folders: COLMAP's undistorted ones, and Inria's distorted
 OWN = {"dense": "dense/images", "distorted": RAW}
-MASKS = "*[Mm][Aa][Ss][Kk]*"  # folders of masks
 # what is said of masks
 UNUSED = (
     "not used: where the checkpoint is empty under them, put them into the photographs' alpha"
     " channel"
 )
-MISSING = 0.5  # the share of photographs that may be missing
-MOST_PARTS = 8  # of the end of a path from another machine
-LONGEST_NAME = 4000  # characters of a path
-LONGEST_PART = 255  # bytes of one of its parts
 
 
 def find_cameras(folder: Path) -> Path:
@@ -127,7 +122,7 @@ def find_photographs(
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
     if cameras.is_dir():
         beside = root.parent if root.name in NAMES else root
-        for masks in sorted(beside.glob(MASKS)):
+        for masks in sorted(beside.glob("*[Mm][Aa][Ss][Kk]*")):
             if any(masks.glob("*")):
                 notes.append(f"the masks in {masks} are {UNUSED}")
     missing = [name for name, path in zip(plain_names, paths, strict=True) if path is None]
@@ -136,7 +131,7 @@ def find_photographs(
         if root.is_dir() and not os.access(root, os.X_OK):
             raise ClodError(f"{root}: cannot be read; check its permissions")
         share = f"{len(missing)} of {len(names)}"
-        if len(missing) > MISSING * len(names):
+        if len(missing) > 0.5 * len(names):
             lists = cameras.name if cameras.is_file() else "the model"
             raise ClodError(
                 f"{root}: {share} images of {lists} are missing {examples}, more than half; put"
@@ -193,7 +188,8 @@ def plain_name(name: str, cameras: Path, home: Path | None = None) -> str:
     path = PureWindowsPath(name)
     longest = max((len(component.encode()) for component in path.parts), default=0)
     control = re.search(r"[\x00-\x1f\x7f-\x9f]", name)
-    if control or len(name) > LONGEST_NAME or longest > LONGEST_PART:
+    # characters and bytes that file systems have room for
+    if control or len(name) > 4000 or longest > 255:
         raise ClodError(
             f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name;"
             " rename it"
@@ -201,7 +197,7 @@ def plain_name(name: str, cameras: Path, home: Path | None = None) -> str:
     if path.parts and not leaves(name):
         return path.as_posix()
     if home is not None:
-        for count in range(min(MOST_PARTS, len(path.parts) - 1), 0, -1):
+        for count in range(min(8, len(path.parts) - 1), 0, -1):
             end = "/".join(path.parts[-count:])
             if not leaves(end) and with_ending(home, end):
                 return end

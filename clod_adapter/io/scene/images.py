@@ -77,16 +77,17 @@ def read_image(
     notes: list[Note] = []
     with _opened(path) as source:
         size = source.size
-        turned = _same_shape(size, height, width) and not _same_shape(size, width, height)
-        turn = _TURNS.get(source.getexif().get(_ORIENTATION, 1)) if turned else None
-        shape = size if turn is None else size[::-1]
-        if not _same_shape(shape, width, height):
-            raise ClodError(
-                f"{path}: is {shape[0]}x{shape[1]}, its camera {width}x{height}, another shape;"
-                " give the images the model was made from"
-            )
-        large = size[0] * size[1] > LARGE
-        factor = max(1, shape[0] // (2 * max_width)) if large else 1
+        final_width = size[0]
+        turn = None
+        if not _same_shape(size, width, height):
+            final_width = size[1]
+            turn = _TURNS.get(source.getexif().get(_ORIENTATION, 1))
+            if turn is None or not _same_shape(size, height, width):
+                raise ClodError(
+                    f"{path}: is {size[0]}x{size[1]}, its camera {width}x{height}, another shape;"
+                    " give the images the model was made from"
+                )
+        factor = final_width // (2 * max_width) if size[0] * size[1] > LARGE else 1
         if factor > 1:
             source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
             factor = max(1, factor * source.width // size[0])
