@@ -67,7 +67,7 @@ def adapted(base, views, shown, config):
         "rows": quality(result.gaussians, shown, dials),
         "at_shares": at_shares(result.gaussians, shown),
         "steps": result.steps,
-        "share": plan.config.share,
+        "share": plan.config.start_share,
         "start_seconds": round(plan.seconds["bands"] + result.start_seconds, 2),
         "train_seconds": round(result.seconds, 2),
     }

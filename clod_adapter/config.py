@@ -12,9 +12,8 @@ from typing import Any
 from clod_adapter.errors import ClodError
 
 FORMS = ("ours", "paper")
-GROWTHS = ("on", "off")
 FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
-LONGEST = 1e6  # dial value of training: its powers stay finite
+NEAREST = 1e-30  # world units, the smallest unit of distances
 STEPS, STEPS_PER_VIEW = 2500, 24.0  # of training, by default, with one view a step
 PLACED_MAX_SV, PLACED_EXPONENT = 8.0, 1.75  # defaults without photographs
 MULTIPLIER = 3.0  # of the distances at which levels of a set begin: PlayCanvas's default
@@ -30,9 +29,22 @@ KINDS: dict[str, tuple[type, str]] = {
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16}  # spherical harmonics of each degree
 
 
-def option(default: Any, help: str) -> Any:
-    """A field whose help is also that of its command-line option."""
-    return field(default=default, metadata={"help": help})
+def option(
+    default: Any,
+    help: str,
+    *,
+    low: float = 0.0,
+    high: float = 1e6,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A field with its help, also that of its command-line option, and what values it may have: a
+    number from ``low`` to ``high``, or text that is one of the ``choices``.
+
+    By default numbers go up to 1e6: powers of a dial value stay finite, and learning rates do not
+    overflow float32.
+    """
+    about = {"help": help, "low": low, "high": high, "choices": choices}
+    return field(default=default, metadata=about)
 
 
 def require(ok: bool, name: str, value: object, what: str) -> None:
@@ -43,29 +55,35 @@ def require(ok: bool, name: str, value: object, what: str) -> None:
         raise ClodError(f"{name} is {value}, it must be {what}")
 
 
-def check_types(config: Any) -> None:
-    """Raises ClodError for a field of another type than its annotation, or a number that is not
-    finite.
+def check_fields(config: Any) -> None:
+    """Raises ClodError for a field of another type than its annotation, or outside its range.
+
+    Numbers of numpy, which JSON does not have, become those of Python.
     """
     for each in fields(config):
-        value, annotation = getattr(config, each.name), each.type.removesuffix(" | None")
+        value = getattr(config, each.name)
+        annotation = each.type.removesuffix(" | None")
         if value is None and annotation != each.type:
             continue
         kind, what = KINDS[annotation]
         require(isinstance(value, kind), each.name, value, f"{what}, not {type(value).__name__}")
-        if kind in (Real, Integral):
-            require(math.isfinite(number(value)), each.name, value, "finite")
+        if kind is str:
+            choices = each.metadata["choices"]
+            require(value in choices, each.name, value, f"one of {', '.join(choices)}")
+        elif kind is not bool:
+            low = each.metadata["low"]
+            high = each.metadata["high"]
+            limits = f"between {low:g} and {high:g}"
+            require(low <= number(value) <= high, each.name, value, limits)
             plain = int(value) if isinstance(value, Integral) else float(value)
-            object.__setattr__(config, each.name, plain)  # of numpy's numbers there is no JSON
+            object.__setattr__(config, each.name, plain)
 
 
 def number(value: Any) -> float:
     """A number of Python, numpy or torch as a float; NaN, which no range contains, if it is none or
     too large.
     """
-    if isinstance(value, str) or not (
-        isinstance(value, Real) or getattr(value, "shape", None) == ()
-    ):
+    if not isinstance(value, Real) and getattr(value, "shape", None) != ():
         return math.nan
     try:
         return float(value)
@@ -86,38 +104,29 @@ class AttenuationConfig:
         ClodError: a field is out of range.
     """
 
-    form: str = option("ours", "equation of the dial: ours, or the paper's")
+    form: str = option("ours", "equation of the dial: ours, or the paper's", choices=FORMS)
     scene_distance: float = option(
-        1.0, "unit of distances, world units; files have 1, sigma_d in world units"
+        1.0,
+        "unit of distances, world units; files have 1, sigma_d in world units",
+        low=NEAREST,
+        high=FARTHEST,
     )
     reference_distance: float = option(
         0.0,
         "median distance in the nearest training views, world units, from which on scales grow; 0"
         " if unknown",
+        high=FARTHEST,
     )
-    max_sv: float = option(5.0, "largest dial value of training")
+    max_sv: float = option(5.0, "largest dial value of training", low=1)
     near_distance: float = option(
         0.0,
         "distance at s = 1, world units, at which far Gaussians take over from near ones; 0 without"
         " near ones",
+        high=FARTHEST,
     )
 
     def __post_init__(self) -> None:
-        check_types(self)
-        require(self.form in FORMS, "form", self.form, f"one of {', '.join(FORMS)}")
-        distance, reference = self.scene_distance, self.reference_distance
-        require(
-            0 < distance < FARTHEST, "scene_distance", distance, f"above 0 and below {FARTHEST:g}"
-        )
-        require(
-            0 <= reference < FARTHEST,
-            "reference_distance",
-            reference,
-            f"at least 0 and below {FARTHEST:g}",
-        )
-        require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
-        near = self.near_distance
-        require(0 <= near < FARTHEST, "near_distance", near, f"at least 0 and below {FARTHEST:g}")
+        check_fields(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,16 +149,15 @@ class ScreenFilter:
         ClodError: the variance is not between 0.001 and 100, or ``compensate`` is not a bool.
     """
 
-    variance: float = option(0.3, "px^2 added to the covariance of every projected Gaussian")
+    variance: float = option(
+        0.3, "px^2 added to the covariance of every projected Gaussian", low=1e-3, high=100
+    )
     compensate: bool = option(
         False, "whether opacities are scaled by c to compensate for the widening"
     )
 
     def __post_init__(self) -> None:
-        check_types(self)
-        require(
-            1e-3 <= self.variance <= 100, "variance", self.variance, "between 0.001 and 100 px^2"
-        )
+        check_fields(self)
 
     def halved(self) -> ScreenFilter:
         """The same filter in the px^2 of images of half the size, which are means of 2x2 pixels:
@@ -165,10 +173,8 @@ class ScreenFilter:
     @property
     def description(self) -> str:
         """Description for messages."""
-        return (
-            f"{self.variance:g} px^2 of blur, opacities"
-            f" {'' if self.compensate else 'not '}compensated for it"
-        )
+        compensated = "compensated" if self.compensate else "not compensated"
+        return f"{self.variance:g} px^2 of blur, opacities {compensated} for it"
 
 
 CLASSIC = ScreenFilter()
@@ -193,32 +199,42 @@ class AdaptConfig:
     form: str = option(
         "ours",
         "training as measured here (ours) or as published (paper); AdaptConfig.paper sets it",
+        choices=FORMS,
     )
-    max_sv: float = option(5.0, "largest dial value to train for")
+    max_sv: float = option(5.0, "largest dial value to train for", low=1)
     iters: int | None = option(
         None,
         f"training steps (default: {STEPS}, or {STEPS_PER_VIEW:g} for each training view if that is"
         " more)",
+        high=1e9,
     )
-    batch: int = option(1, "views per step; learning rates scale with its square root")
+    batch: int = option(
+        1, "views per step; learning rates scale with its square root", low=1, high=4096
+    )
     time_budget: float | None = option(
         None,
         "stop training after this many seconds; schedules are scaled to it (default: no limit)",
+        low=1e-3,
     )
-    seed: int = option(0, "seed of the view order, the dial values and the importance estimate")
-    start_share: float | None = option(
-        None, "share of Gaussians to keep at s = 1 where there are no far ones (default: 0.62)"
+    seed: int = option(
+        0, "seed of the view order, the dial values and the importance estimate", high=2**63 - 1
+    )
+    start_share: float = option(
+        0.62, "share of Gaussians to keep at s = 1 where there are no far ones", low=0.501, high=1
     )
     exponent: float = option(
-        1.5, "target-count curve: the target share of Gaussians at s is s^-exponent"
+        1.5, "target-count curve: the target share of Gaussians at s is s^-exponent", low=1e-3
     )
     reg_weight: float = option(1.0, "weight of the count loss (the paper's lambda_reg)")
-    ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w")
+    ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w", high=1)
     lr_sigma: float = option(
-        0.05, "learning rate of log sigma_d: its largest relative change per step"
+        0.05,
+        "learning rate of log sigma_d: its largest relative change per step",
     )
     growth: str = option(
-        "on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off"
+        "on",
+        "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off",
+        choices=("on", "off"),
     )
     lr_growth: float = option(1.2e-2, "learning rate of growth_d")
     lr_means: float = option(0.06, "learning rate of means, times the Gaussian's own size")
@@ -227,36 +243,12 @@ class AdaptConfig:
     lr_opacities: float = option(0.1, "learning rate of opacity_logits")
     lr_sh0: float = option(4e-3, "learning rate of sh0")
     lr_shN: float = option(
-        0.0, "learning rate of shN; 0 keeps SH degrees above 0 fixed, which costs 0.01 dB"
+        0.0,
+        "learning rate of shN; 0 keeps SH degrees above 0 fixed, which costs 0.01 dB",
     )
 
     def __post_init__(self) -> None:
-        check_types(self)
-        require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
-        require(self.max_sv <= LONGEST, "max_sv", self.max_sv, f"at most {LONGEST:g}")
-        require(self.iters is None or self.iters >= 0, "iters", self.iters, "at least 0")
-        require(1 <= self.batch <= 4096, "batch", self.batch, "between 1 and 4096")
-        require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
-        require(
-            self.time_budget is None or self.time_budget > 0,
-            "time_budget",
-            self.time_budget,
-            "positive seconds",
-        )
-        require(0.5 < self.share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
-        for name, allowed in {"form": FORMS, "growth": GROWTHS}.items():
-            require(
-                getattr(self, name) in allowed,
-                name,
-                getattr(self, name),
-                f"one of {', '.join(allowed)}",
-            )
-        require(self.exponent > 0, "exponent", self.exponent, "positive")
-        require(self.reg_weight >= 0, "reg_weight", self.reg_weight, "at least 0")
-        require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
-        for name in ("sigma", "growth", "means", "quats", "scales", "opacities", "sh0", "shN"):
-            rate = getattr(self, f"lr_{name}")  # larger ones overflow float32 in the end
-            require(0 <= rate <= 1e6, f"lr_{name}", rate, "between 0 and 1e6")
+        check_fields(self)
 
     @classmethod
     def paper(cls, **changes: Any) -> AdaptConfig:
@@ -278,7 +270,7 @@ class AdaptConfig:
             "lr_opacities": 5e-2,
             "lr_sh0": 2e-3,
         }
-        return cls(**{**own, **changes})
+        return cls(**own | changes)
 
     @classmethod
     def placed(cls, **changes: Any) -> AdaptConfig:
@@ -288,12 +280,7 @@ class AdaptConfig:
         as near Gaussians, the checkpoint's own, reach farther (``training/far.py``).
         """
         own: dict[str, Any] = {"max_sv": PLACED_MAX_SV, "exponent": PLACED_EXPONENT}
-        return cls(**{**own, **changes})
-
-    @property
-    def share(self) -> float:
-        """``start_share``, or 0.62 if it is not set."""
-        return 0.62 if self.start_share is None else self.start_share
+        return cls(**own | changes)
 
     @property
     def steps(self) -> int:

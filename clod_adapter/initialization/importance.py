@@ -182,13 +182,13 @@ def extinction_from_rank(rank: Tensor, config: AdaptConfig, total: int | None = 
 
     The Gaussian of ``rank`` (0 the most important, integers below N) is culled where
     ``target_count.target_curve`` falls to its share of the ranks, or of ``total``. Ranks beyond
-    ``config.share`` are culled before s = 1.
+    ``config.start_share`` are culled before s = 1.
     """
     share = (rank.double() + 0.5) / (total or len(rank))
-    discriminant = share**-2 - 4 * (1 / config.share - 1)
+    discriminant = share**-2 - 4 * (1 / config.start_share - 1)
     power = (1 / share + discriminant.clamp(min=0).sqrt()) / 2
     return torch.where(
-        share <= config.share, power ** (1 / config.exponent), config.share / share
+        share <= config.start_share, power ** (1 / config.exponent), config.start_share / share
     ).float()
 
 

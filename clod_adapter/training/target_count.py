@@ -35,7 +35,7 @@ def target_share(
     least one.
     """
     total = total or max(count, 1)
-    share = max(target_curve(virtual_scale, config.share, config.exponent), 1 / total)
+    share = max(target_curve(virtual_scale, config.start_share, config.exponent), 1 / total)
     return min(share * (total / max(count, 1)), 1.0)
 
 

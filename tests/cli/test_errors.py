@@ -99,7 +99,7 @@ ERRORS = [
         "base.ply --images empty",
         "empty: no COLMAP model.*, and no transforms.json; give the folder",
     ),
-    ("base.ply --images scene --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),
+    ("base.ply --images scene --max-sv 0.5", "--max-sv is 0.5, it must be between 1 and"),
     (
         "base.ply --images scene --with quats --without sh0 quats",
         "--with and --without both name quats",

@@ -90,7 +90,7 @@ def test_count_gradient_penalises_excess_and_deficit():
     """The gradient is that of the squared excess; it is 0 for a single remaining Gaussian."""
     log_sigma, d = reaches_and_distances()
     for s in (1.5, 6.0):
-        share = target_curve(s, CONFIG.share, CONFIG.exponent)
+        share = target_curve(s, CONFIG.start_share, CONFIG.exponent)
         excess = float((d * s < log_sigma.exp()).float().mean()) / share - 1
         want = 0.1 * 2 * CONFIG.reg_weight * excess / share * count_slope(d * s, log_sigma.exp())
         assert excess > 0.1
