@@ -38,9 +38,7 @@ THOMSEN = 1.6075
 
 @dataclass(frozen=True)
 class Mixture:
-    """Masses ``[N]``, centres ``[N, 3]``, covariances ``[N, 6]`` in the order of _ENTRIES,
-    harmonics ``[N, 3 K]``.
-    """
+    """Masses ``[N]``, centres ``[N, 3]``, covariances ``[N, 3, 3]``, harmonics ``[N, 3 K]``."""
 
     mass: np.ndarray
     means: np.ndarray
@@ -56,13 +54,13 @@ class Mixture:
         share = self.mass / total[groups]
 
         def mean(values: np.ndarray) -> np.ndarray:
-            return np.stack([np.bincount(groups, share * column) for column in values.T], 1)
+            columns = values.reshape(len(values), -1).T
+            means = [np.bincount(groups, share * column) for column in columns]
+            return np.stack(means, 1).reshape(-1, *values.shape[1:])
 
         means = mean(self.means)
-        spread = _products((self.means - means[groups]).T).T
-        return Mixture(
-            total, means, mean(self.covariances + spread), mean(self.harmonics).astype(np.float32)
-        )
+        covariances = mean(self.covariances + _products(self.means - means[groups]))
+        return Mixture(total, means, covariances, mean(self.harmonics).astype(np.float32))
 
 
 @np.errstate(under="ignore")
@@ -96,8 +94,7 @@ def merge(
 def mixture_of(gaussians: Gaussians) -> Mixture:
     scales = float64_array(gaussians.log_scales.double().exp())
     axes = _rotations(float64_array(gaussians.quats))
-    full = np.einsum("nij,nj,nkj->nik", axes, scales**2, axes)
-    covariances = np.stack([full[:, i, j] for i, j in _ENTRIES], 1)
+    covariances = np.einsum("nij,nj,nkj->nik", axes, scales**2, axes)
     mass = float64_array(gaussians.opacities) * _areas(scales) + np.finfo(np.float32).tiny
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1).detach().float().cpu()
     harmonics = coefficients.flatten(1).numpy()
@@ -106,10 +103,7 @@ def mixture_of(gaussians: Gaussians) -> Mixture:
 
 def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
     """The Gaussians of a mixture, with the screen filter and the SH degree of ``like``."""
-    full = np.empty((len(mixture), 3, 3))
-    for (i, j), column in zip(_ENTRIES, mixture.covariances.T, strict=True):
-        full[:, i, j] = full[:, j, i] = column
-    variances, axes = np.linalg.eigh(full)
+    variances, axes = np.linalg.eigh(mixture.covariances)
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
     scales = np.sqrt(np.maximum(variances, THINNEST**2))
     opacities = np.clip(mixture.mass / _areas(scales), 1e-6, OPAQUEST)
@@ -127,9 +121,6 @@ def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
         tensor = torch.from_numpy(np.ascontiguousarray(array, np.float32))
         fields[name] = tensor.to(like.means)
     return Gaussians(**fields, screen_filter=like.screen_filter)
-
-
-_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
@@ -174,7 +165,7 @@ def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarra
 
 def _neighbours(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
     """Each pair of a Gaussian and one of its NEIGHBOURS nearest once, the smaller number first."""
-    sizes = np.sqrt(mixture.covariances[:, :3].max(1))
+    sizes = np.sqrt(mixture.covariances.max((1, 2)))  # the largest is on the diagonal
     pairs = []
     for rows, _, near in nearest(without_crowds(mixture.means, sizes), NEIGHBOURS):
         low = np.minimum(rows[:, None], near)
@@ -188,15 +179,19 @@ def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray
     squared difference of colours.
     """
     cost = np.empty(len(first))
-    entropy = _log_determinants(mixture.covariances.T)
+    entropy = _log_determinants(mixture.covariances)
     for start in range(0, len(first), EDGES):
         block = slice(start, start + EDGES)
         i = first[block]
         j = second[block]
         p = mixture.mass[i] / (mixture.mass[i] + mixture.mass[j])
         q = 1 - p
-        merged = p * mixture.covariances[i].T + q * mixture.covariances[j].T
-        merged += p * q * _products((mixture.means[i] - mixture.means[j]).T)
+        between = _products(np.sqrt(p * q)[:, None] * (mixture.means[i] - mixture.means[j]))
+        merged = (
+            p[:, None, None] * mixture.covariances[i]
+            + q[:, None, None] * mixture.covariances[j]
+            + between
+        )
         shape = _log_determinants(merged) - p * entropy[i] - q * entropy[j]
         colours = mixture.harmonics[i] - mixture.harmonics[j]
         cost[block] = shape / 2 + COLOUR * np.square(colours).sum(1)
@@ -204,16 +199,14 @@ def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray
 
 
 def _products(vectors: np.ndarray) -> np.ndarray:
-    """``[6, N]`` the entries of ``v v^T`` of vectors ``[3, N]``."""
-    return np.stack([vectors[i] * vectors[j] for i, j in _ENTRIES])
+    """``[N, 3, 3]`` products ``v v^T`` of vectors ``[N, 3]``."""
+    return vectors[:, :, None] * vectors[:, None]
 
 
 def _log_determinants(covariances: np.ndarray) -> np.ndarray:
-    """``[N]`` logarithms of the determinants of covariances ``[6, N]``."""
-    xx, yy, zz = covariances[:3] + THINNEST
-    xy, xz, yz = covariances[3:]
-    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    return np.log(np.maximum(determinant, np.finfo(np.float64).tiny))
+    """``[N]`` logarithms of the determinants of covariances ``[N, 3, 3]``."""
+    determinants = np.linalg.det(covariances + THINNEST * np.eye(3))
+    return np.log(np.maximum(determinants, np.finfo(np.float64).tiny))
 
 
 def _areas(scales: np.ndarray) -> np.ndarray:

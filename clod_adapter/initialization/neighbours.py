@@ -6,7 +6,7 @@ import numpy as np
 
 from clod_adapter._kernels import threads
 
-ROWS = 1 << 17  # rows whose neighbours are in memory at a time
+ROWS = 1 << 13  # rows at a time, whose neighbours and their attributes fit in the cache
 # A k-d tree cannot split equal points, and compares each with all others.
 CROWD = 64  # Gaussians with equal centres, from which on they are displaced
 JITTER = 1e-6  # largest displacement, a share of their size

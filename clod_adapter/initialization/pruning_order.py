@@ -22,7 +22,6 @@ APART = 0.05  # weight of the distance, relative to a squared difference of colo
 DIFFERENT = 1e12  # dissimilarity for colours or sizes that are not finite
 # of the remaining: if a round removes fewer, it removes the cheapest REMOVED without conditions
 STUCK = 0.02
-BLOCK = 1 << 13  # rows that are compared at a time: three times as fast as it fits in cache
 DIALS = 24  # dial values of the fit of growth, evenly spaced in log s
 LARGEST_EXPONENT = 1.0  # of the fit, before SHARE
 SHARE = 0.65  # of the fitted exponents that is used; 0.5 and 0.8 are no better at any share
@@ -58,9 +57,7 @@ def pruning_order(
         raise ClodError("means are not all finite, so neighbours are not defined; remove such rows")
     count = len(gaussians)
     colours = 0.5 + SH_C0 * float64_array(gaussians.sh0[:, 0])
-    sizes = np.empty(0)
-    if count:
-        sizes = float64_array(gaussians.log_scales.double().exp().amax(1))
+    sizes = float64_array(gaussians.log_scales.double().exp().amax(1))
     weights = float64_array(importance).copy()
     order = np.empty(count, np.int64)
     centres = without_crowds(float64_array(gaussians.means), sizes)
@@ -105,13 +102,10 @@ def _substitutes(
     substitute = np.empty(len(centres), np.int64)
     difference = np.empty(len(centres))
     channels = np.ascontiguousarray(colours.T)
-    for tree_rows, distances, near in nearest(centres, NEIGHBOURS):
-        for at in range(0, len(tree_rows), BLOCK):
-            rows = tree_rows[at : at + BLOCK]
-            block = slice(at, at + BLOCK)
-            substitute[rows], difference[rows] = _most_similar(
-                rows, near[block].T, distances[block].T, channels, sizes
-            )
+    for rows, distances, near in nearest(centres, NEIGHBOURS):
+        substitute[rows], difference[rows] = _most_similar(
+            rows, near.T, distances.T, channels, sizes
+        )
     return substitute, difference
 
 
@@ -178,9 +172,6 @@ def _kept_substitutes(kept: Tensor, substitutes: Tensor) -> Tensor:
     """
     rows = torch.arange(len(kept), device=kept.device)
     substitute = torch.where(kept, rows, substitutes)
-    # each time chains are twice as long; there may be circles of removed ones
-    for _ in range(len(kept).bit_length()):
-        if torch.equal(further := substitute[substitute], substitute):
-            break
-        substitute = further
+    for _ in range(len(kept).bit_length()):  # each time chains are twice as long
+        substitute = substitute[substitute]
     return substitute
