@@ -179,8 +179,6 @@ def describe(run: Run, result: Result) -> Report:
             "count": count,
             "backend": BACKENDS[device.type] if count > 1 else None,
             "batch": run.config.batch,
-            "waiting_seconds": round(adapted.waiting, 3),
-            "exchange_seconds": round(adapted.exchanging, 3),
         },
         "outputs": vars(run.outputs),
         "sh_degree": result.gaussians.sh_degree,

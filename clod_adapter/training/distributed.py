@@ -10,7 +10,6 @@ import io
 import math
 import os
 import re
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
@@ -18,7 +17,6 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
 
 from clod_adapter.errors import ClodError
 from clod_adapter.training.optimizer import GradientSum
@@ -31,7 +29,6 @@ T = TypeVar("T")
 # A process that does not answer for so long counts as lost. The first one may be evaluating or
 # saving meanwhile.
 PATIENCE = timedelta(minutes=10)
-CHUNK = 1 << 28  # bytes sent at a time
 OLDEST = "2.9"  # torch
 
 
@@ -43,15 +40,12 @@ class ProcessGroup:
     """The processes that train together: the default group of ``torch.distributed``.
 
     All call the methods in the same order. They raise ProcessLost if a process has ended; no
-    exchange is possible then. ``waiting`` and ``exchanging`` are seconds spent waiting for the
-    slowest process, and sending and summing.
+    exchange is possible then.
     """
 
     def __init__(self) -> None:
         self.rank = dist.get_rank()
         self.size = dist.get_world_size()
-        self.waiting = 0.0
-        self.exchanging = 0.0
 
     def share(self, work: Sequence[T]) -> Sequence[T]:
         """This process's share of the work: every ``size``-th item, from its rank on."""
@@ -61,18 +55,19 @@ class ProcessGroup:
         """The first process's ``share_done``, and whether all processes continue."""
         share = share_done if self.rank == 0 else -math.inf
         numbers = torch.tensor([share, 0.0 if going else 1.0], dtype=torch.float64)
-        self._meet(numbers, "MAX")
+        with _losses():
+            dist.all_reduce(numbers, dist.ReduceOp.MAX)
         return float(numbers[0]), not numbers[1]
 
     def sum(self, total: GradientSum) -> GradientSum:
         """The sum over all processes; overwrites the gradients given."""
         loss = torch.tensor([float(total.loss), total.views], dtype=torch.float64)
-        self._meet(loss)
         gradients = {name: gradient.contiguous() for name, gradient in total.gradients.items()}
         kept = total.kept.to(torch.uint8)
         # All at once and in place. Sending only the rows kept, or one packed message, takes longer:
         # on loopback a million Gaussians take 80 ms, packed 150 ms, only the rows kept 300 ms.
-        with self._timed("exchanging"):
+        with _losses():
+            dist.all_reduce(loss)  # on the CPU first, where gloo reports a lost process at once
             under_way = [dist.all_reduce(kept, dist.ReduceOp.MAX, async_op=True)]
             for gradient in gradients.values():
                 under_way.append(dist.all_reduce(gradient, async_op=True))
@@ -87,37 +82,15 @@ class ProcessGroup:
         ignored.
         """
         file = io.BytesIO()
-        self._meet()
-        with self._timed("exchanging"):
-            if self.rank == 0:
-                torch.save(value, file)
-            size = torch.tensor([len(file.getbuffer())])
-            dist.broadcast(size, 0)
-            sent = torch.empty(int(size), dtype=torch.uint8)
-            if self.rank == 0:
-                sent = torch.frombuffer(file.getbuffer(), dtype=torch.uint8)
-            for chunk in sent.split(CHUNK):
-                dist.broadcast(chunk, 0)
+        if self.rank == 0:
+            torch.save(value, file)
+        message = [file.getvalue()]
+        with _losses():
+            dist.broadcast_object_list(message, 0)
         if self.rank == 0:
             return value
-        received = io.BytesIO(sent.numpy().data)
+        received = io.BytesIO(message[0])
         return cast(T, torch.load(received, map_location="cpu", weights_only=False))
-
-    def _meet(self, numbers: Tensor | None = None, operation: str = "SUM") -> None:
-        """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost
-        process at once.
-        """
-        if numbers is None:
-            numbers = torch.zeros(1, dtype=torch.float32)
-        with self._timed("waiting"):
-            dist.all_reduce(numbers, getattr(dist.ReduceOp, operation))
-
-    @contextmanager
-    def _timed(self, name: str) -> Iterator[None]:
-        began = time.perf_counter()
-        with _losses():
-            yield
-        setattr(self, name, getattr(self, name) + time.perf_counter() - began)
 
 
 def require_distributed() -> None:

@@ -153,7 +153,6 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     going = True
     first = trainer.done + 1
     stop = GracefulStop()
-    before = (group.waiting, group.exchanging) if group else (0.0, 0.0)
 
     def tell(error: str | None = None) -> bool:
         """Whether the listener wants training to go on."""
@@ -190,7 +189,6 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
             failed = str(error)
             tell(failed)
         trainer.seconds = time.perf_counter() - began
-        waited = (group.waiting - before[0], group.exchanging - before[1]) if group else (0.0, 0.0)
         result = trainer.gaussians()
     signalled = stop.requests > 0
     return Adapted(
@@ -200,7 +198,6 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
         trainer.start_seconds,
         not going or signalled,
         lost,
-        *waited,
         failed,
         int(trainer.ever_nonfinite.sum()),
         signalled,

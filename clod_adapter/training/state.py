@@ -96,8 +96,6 @@ class Adapted:
         interrupted: training ended early: the listener returned False, Ctrl-C, a process was lost,
             or the loss of a step was not finite.
         lost: which process was lost; failed: which step's loss was not finite.
-        waiting, exchanging: seconds of this call spent waiting for and exchanging with other
-            processes.
         held: the number of Gaussians that some step of this call did not move because their
             gradient was not finite.
         signalled: a Ctrl-C, or another signal with Python's own handler, arrived.
@@ -109,8 +107,6 @@ class Adapted:
     start_seconds: float
     interrupted: bool
     lost: str | None = None
-    waiting: float = 0.0
-    exchanging: float = 0.0
     failed: str | None = None
     held: int = 0
     signalled: bool = False

@@ -96,7 +96,7 @@ def test_two_give_the_result_of_one(server, words, tmp_path):
     report = again.report()
     want = alone.report()
     assert report["processes"].items() >= {"count": 2, "backend": "gloo", "batch": 2}.items()
-    assert report["processes"]["exchange_seconds"] > 0 and want["processes"]["count"] == 1
+    assert want["processes"]["count"] == 1
     assert (report["resumed_from"], report["steps"], report["interrupted"]) == (4, 12, False)
     assert again.log(0).count("2 processes (gloo): 2 views a step, 12 steps") == 1
     assert again.log(1) == "" and not (run.folder / STATE).exists()
