@@ -66,9 +66,9 @@ class Gaussians:
     screen_filter: ScreenFilter = CLASSIC
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            if isinstance(value := getattr(self, field.name), np.ndarray):
-                object.__setattr__(self, field.name, float_tensor(value))
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, name, float_tensor(value))
         n = len(self.means)
         shapes = {
             "means": (n, 3),
@@ -79,21 +79,15 @@ class Gaussians:
             "sigma_d": (n,),
             "growth_d": (n,),
         }
+        harmonics = [(n, count - 1, 3) for count in SH_COUNTS.values()]
         for name, value in self.tensors().items():
-            require(
-                value.is_floating_point(),
-                f"Gaussians.{name}",
-                value.dtype,
-                "floating point: .float()",
-            )
+            floats = value.is_floating_point()
+            require(floats, f"Gaussians.{name}", value.dtype, "floating point: .float()")
             shape = tuple(value.shape)
-            if name != "shN" and shape != shapes[name]:
-                raise ClodError(f"Gaussians.{name} has shape {shape}, expected {shapes[name]}")
-            if name == "shN" and shape not in [(n, count - 1, 3) for count in SH_COUNTS.values()]:
-                raise ClodError(
-                    f"Gaussians.shN has shape {shape}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8,"
-                    " 15"
-                )
+            allowed = [shapes[name]] if name in shapes else harmonics
+            if shape not in allowed:
+                expected = " or ".join(map(str, allowed))
+                raise ClodError(f"Gaussians.{name} has shape {shape}, expected {expected}")
         if (self.sigma_d is None) != (self.attenuation is None):
             raise ClodError("Gaussians needs both sigma_d and attenuation, or neither")
         if self.growth_d is not None and self.sigma_d is None:
@@ -121,17 +115,14 @@ class Gaussians:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Gaussians):
             return NotImplemented
-        mine = self.tensors()
-        theirs = other.tensors()
-        if mine.keys() != theirs.keys() or self.attenuation != other.attenuation:
-            return False
-        if self.screen_filter != other.screen_filter:
-            return False
-        for name, value in mine.items():
-            other_value = theirs[name]
-            if (value.device, value.dtype) != (other_value.device, other_value.dtype):
-                return False
-            if not torch.equal(value, other_value):
+        for name, mine in vars(self).items():
+            theirs = getattr(other, name)
+            if isinstance(mine, Tensor) and isinstance(theirs, Tensor):
+                same_kind = (mine.device, mine.dtype) == (theirs.device, theirs.dtype)
+                same = same_kind and torch.equal(mine, theirs)
+            else:
+                same = mine == theirs
+            if not same:
                 return False
         return True
 
@@ -169,11 +160,9 @@ class Gaussians:
     def summary(self) -> str:
         """``120,000, SH degree 3, dial to 5 with growth``."""
         dial = "no dial" if self.attenuation is None else describe_dial(self)
-        count = (
-            f"{len(self):,}"
-            if self.near is None
-            else f"{self.whole:,} and {len(self) - self.whole:,} far"
-        )
+        count = f"{self.whole:,}"
+        if self.near is not None:
+            count += f" and {len(self) - self.whole:,} far"
         return f"{count}, SH degree {self.sh_degree}, {dial}"
 
     @property
@@ -192,11 +181,7 @@ class Gaussians:
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensor fields by name; without those that are None."""
-        return {
-            f.name: value
-            for f in dataclasses.fields(self)
-            if isinstance(value := getattr(self, f.name), Tensor)
-        }
+        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
 
     def replace(self, **changes: Tensor | AttenuationConfig | ScreenFilter | None) -> Gaussians:
         """A copy with the named fields replaced."""
@@ -246,17 +231,9 @@ class LossNotFinite(Exception):
     """The loss of a training step is not finite."""
 
 
-def bad_rows(values: Tensor) -> Tensor | None:
-    """``[N]`` bool, the rows of ``values [N, ...]`` with a value that is not finite; None if there
-    is none.
-    """
-    bad = nonfinite_rows({"": values})
-    return bad if bool(bad.any()) else None
-
-
-def nonfinite_rows(gradients: dict[str, Tensor]) -> Tensor:
-    """``[N]`` bool, the rows that are bad in any of the gradients ``[N, ...]``."""
-    tensors = list(gradients.values())  # their sums take one pass without extra memory
+def nonfinite_rows(*tensors: Tensor) -> Tensor:
+    """``[N]`` bool, the rows with a value that is not finite in any of the tensors ``[N, ...]``."""
+    # sums take one pass without extra memory
     if tensors[0].device.type == "cpu" and all(bool(tensor.sum().isfinite()) for tensor in tensors):
         # A GPU is not asked: the host would wait for its answer.
         return torch.zeros(len(tensors[0]), dtype=torch.bool, device="cpu")
@@ -274,13 +251,12 @@ def require_finite(gaussians: Gaussians, what: str, remedy: str) -> None:
     for name, values in gaussians.tensors().items():
         if name == "opacity_logits":
             values = torch.where(values.isinf(), 0.0, values)  # +-inf are opacities of 1 and 0
-        if (bad := bad_rows(values)) is None:
-            continue
-        first = int(bad.nonzero()[0, 0])
-        raise ClodError(
-            f"{what}: {name} is not finite in {int(bad.sum()):,} rows (the first is {first});"
-            f" {remedy}"
-        )
+        rows = nonfinite_rows(values).nonzero()
+        if len(rows):
+            raise ClodError(
+                f"{what}: {name} is not finite in {len(rows):,} rows (the first is"
+                f" {int(rows[0, 0])}); {remedy}"
+            )
 
 
 def largest_colour(gaussians: Gaussians) -> str:

@@ -41,18 +41,16 @@ def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
     """``psnr``, and the mean structural similarity in [-1, 1] (Wang et al. 2004), as evaluations
     report them.
 
-    Both by scikit-image. Gaussian window of 11 taps with sigma 1.5, population covariance, data
-    range 1. As in 3DGS, windows at the border read zeros beyond it and every pixel counts:
-    scikit-image leaves out the pixels within 5 of the border, and zeros added there are what it
-    leaves out here.
+    The similarity is scikit-image's: Gaussian window of 11 taps with sigma 1.5, population
+    covariance, data range 1. As in 3DGS, windows at the border read zeros beyond it and every pixel
+    counts: scikit-image leaves out the pixels within 5 of the border, and zeros added there are
+    what it leaves out here.
     """
-    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+    from skimage.metrics import structural_similarity
 
     clamped = image.detach().clamp(0, 1).cpu()
     render = clamped.numpy()
     photograph = unit(target, clamped).numpy()
-    with np.errstate(divide="ignore"):  # equal images
-        value = peak_signal_noise_ratio(photograph, render, data_range=1)
     border = [(WINDOW // 2, WINDOW // 2)] * 2 + [(0, 0)]
     similarity = structural_similarity(
         np.pad(photograph, border),
@@ -63,7 +61,7 @@ def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
         data_range=1,
         channel_axis=-1,
     )
-    return float(value), float(similarity)
+    return psnr(image, target), float(similarity)
 
 
 def ssim_plain(image: Tensor, target: Tensor) -> Tensor:

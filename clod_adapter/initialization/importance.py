@@ -15,7 +15,7 @@ from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import median_distance, typical_distance
 from clod_adapter.equation.units import in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0, Gaussians, bad_rows, largest_colour
+from clod_adapter.gaussians import SH_C0, Gaussians, largest_colour, nonfinite_rows
 from clod_adapter.initialization.pruning_order import PruningOrder, initial_growth, pruning_order
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
@@ -168,9 +168,10 @@ def removal_error(
         (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)
         total += (gradient * opacities.detach()).square()
         tell(progress, Phase.IMPORTANCE, done, len(views))
-    if (bad := bad_rows(total)) is not None:
+    count = int(nonfinite_rows(total).sum())
+    if count:
         raise ClodError(
-            f"the image error of removing each of {int(bad.sum()):,} Gaussians is not finite;"
+            f"the image error of removing each of {count:,} Gaussians is not finite;"
             f" {largest_colour(gaussians)}"
         )
     return total / max(len(views), 1)

@@ -209,9 +209,8 @@ def _usable(gaussians: Gaussians) -> Tensor:
     """``[n]`` int64, the visible and finite Gaussians. An infinite opacity logit is a fully opaque
     Gaussian.
     """
-    others = gaussians.tensors()
-    del others["opacity_logits"]
-    rows = (gaussians.opacities > VISIBLE) & ~nonfinite_rows(others)
+    others = gaussians.replace(opacity_logits=gaussians.opacities).tensors().values()
+    rows = (gaussians.opacities > VISIBLE) & ~nonfinite_rows(*others)
     if not rows.any():
         raise ClodError(
             "no camera can be placed: the checkpoint has no Gaussian that is visible and finite"

@@ -200,7 +200,7 @@ class Trainer:
         which.
         """
         loss_finite = torch.as_tensor(total.loss).isfinite()
-        nonfinite = nonfinite_rows(total.gradients)
+        nonfinite = nonfinite_rows(*total.gradients.values())
         self.ever_nonfinite |= loss_finite & nonfinite
         finite = nonfinite.logical_not_().logical_and_(loss_finite)
         rates = {
