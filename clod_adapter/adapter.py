@@ -66,9 +66,8 @@ class Adapter:
     notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
-        for name in DIAL:
-            if (column := getattr(self, name)) is not None:
-                object.__setattr__(self, name, tensor_of(column))
+        for name, column in dial_tensors(self).items():
+            object.__setattr__(self, name, tensor_of(column))
         for name in ("updates", "added"):
             tensors = {key: tensor_of(value) for key, value in getattr(self, name).items()}
             object.__setattr__(self, name, tensors)
@@ -84,26 +83,18 @@ class Adapter:
         require(plain, "Adapter.version", repr(self.version), "printable ASCII")
         for name, update in self.updates.items():
             if name not in ATTRIBUTES:
-                raise ClodError(
-                    f"Adapter.updates has {name!r}, it may have {', '.join(ATTRIBUTES)}"
-                )
-            sound = (
-                update.dtype in (torch.float16, torch.float32)
-                and update.shape[:1] == self.sigma_d.shape
-            )
-            require(
-                sound,
-                f"Adapter.updates[{name!r}]",
-                kind_of(update),
-                f"float16 or float32 of {count} rows",
-            )
+                known = ", ".join(ATTRIBUTES)
+                raise ClodError(f"Adapter.updates has {name!r}, it may have {known}")
+            floats = update.dtype in (torch.float16, torch.float32)
+            sound = floats and update.shape[:1] == self.sigma_d.shape
+            what = f"float16 or float32 of {count} rows"
+            require(sound, f"Adapter.updates[{name!r}]", kind_of(update), what)
         if self.added:
             attributes: Any = self.added
             far = Gaussians(**attributes)  # checks names and shapes
             fits = not self.updates and len(far) < count
-            require(
-                fits, "Adapter.added", f"of {len(far)} of {count} rows", "of fewer, without updates"
-            )
+            rows = f"of {len(far)} of {count} rows"
+            require(fits, "Adapter.added", rows, "of fewer, without updates")
 
     def __repr__(self) -> str:
         updates = ", ".join(self.updates) or "nothing"
@@ -114,7 +105,7 @@ class Adapter:
     @property
     def base_count(self) -> int:
         """The number of Gaussians of the base."""
-        return len(self.sigma_d) - (len(self.added["means"]) if self.added else 0)
+        return len(self.sigma_d) - len(self.added.get("means", ()))
 
     def apply(self, base: Gaussians, fingerprint: str | None = None) -> Gaussians:
         """The adapted Gaussians: the base plus the differences in float32, and the dial.
@@ -127,44 +118,42 @@ class Adapter:
         Raises:
             ClodError: a different base was given.
         """
-        difference = None
         if fingerprint is not None and fingerprint != self.base_fingerprint:
-            difference = (
-                f"its SHA-256 is {fingerprint[:12]}..., the adapter was trained on"
-                f" {self.base_fingerprint[:12]}..."
-            )
-        elif len(base) != self.base_count:
-            difference = f"it has {len(base)} Gaussians, the adapter {self.base_count}"
-        if difference:
-            raise ClodError(
-                f"a different base was given: {difference}; give the checkpoint it was trained on"
-            )
-        changes: dict[str, Tensor] = {}
+            raise _other_base(f"SHA-256 {fingerprint}", self.base_fingerprint)
+        if len(base) != self.base_count:
+            raise _other_base(f"{len(base)} Gaussians", self.base_count)
+        plain = base.replace(sigma_d=None, growth_d=None, attenuation=None)
+        device = base.means.device
+        changes: Any = {name: column.to(device) for name, column in dial_tensors(self).items()}
+        changes |= {"attenuation": self.attenuation, "screen_filter": self.screen_filter}
+        if self.added:
+            attributes: Any = {name: values.to(device) for name, values in self.added.items()}
+            for name in dial_tensors(self):
+                changes[name] = changes[name][len(base) :]
+            return with_near(plain, Gaussians(**attributes, **changes))
         for name, update in self.updates.items():
             old = getattr(base, name)
             if update.shape != old.shape:
-                raise ClodError(
-                    f"a different base was given: {name} is {kind_of(old)}, the adapter's"
-                    f" {kind_of(update)}"
-                )
-            update = update.to(old.device)
+                raise _other_base(f"{name} {kind_of(old)}", kind_of(update))
+            update = update.to(device)
             # old, not old + 0, where nothing changed: that would turn -0 into 0
             if update.dtype == torch.float16:
                 update = torch.where(update == 0, old, old + update.float())
             changes[name] = update
-        plain = base.replace(sigma_d=None, growth_d=None, attenuation=None)
-        settings: Any = {"attenuation": self.attenuation, "screen_filter": self.screen_filter}
-        columns = {name: x.to(base.means.device) for name, x in dial_tensors(self).items()}
-        if self.added:
-            far: Any = {name: x.to(base.means.device) for name, x in self.added.items()}
-            far |= {name: column[len(base) :] for name, column in columns.items()}
-            return with_near(plain, Gaussians(**far, **settings))
-        return plain.replace(**changes, **columns, **settings)
+        return plain.replace(**changes)
+
+
+def _other_base(given: str, expected: object) -> ClodError:
+    return ClodError(
+        f"a different base was given: it has {given}, the adapter {expected}; give the checkpoint"
+        " it was trained on"
+    )
 
 
 def dial_tensors(owner: Adapter | Gaussians) -> dict[str, Tensor]:
     """The columns of DIAL that it has, by name."""
-    return {name: column for name in DIAL if (column := getattr(owner, name)) is not None}
+    columns = {name: getattr(owner, name) for name in DIAL}
+    return {name: column for name, column in columns.items() if column is not None}
 
 
 def extract(
@@ -200,9 +189,9 @@ def extract(
     added = dict[str, Tensor]()
     near = adapted
     if adapted.near is not None and base.near is None:
-        near, far = (adapted.select(rows) for rows in (adapted.near, ~adapted.near))
-        for name in ATTRIBUTES:
-            added[name] = getattr(far, name).detach().float().cpu().clone()
+        near = adapted.select(adapted.near)
+        far = adapted.select(~adapted.near)
+        added = {name: _stored(getattr(far, name)) for name in ATTRIBUTES}
     for name in ATTRIBUTES:
         old = getattr(base, name).detach().float()
         new = getattr(near, name).detach().float()
@@ -213,9 +202,7 @@ def extract(
             )
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
-    columns: dict[str, Any] = {}
-    for name, column in dial_tensors(adapted).items():
-        columns[name] = column.detach().float().cpu().clone()
+    columns: Any = {name: _stored(column) for name, column in dial_tensors(adapted).items()}
     return Adapter(
         **columns,
         attenuation=adapted.attenuation,
@@ -260,8 +247,13 @@ def detach(gaussians: Gaussians) -> Gaussians:
     Example:
         >>> plain = clod.detach(clod.load("model.ply").gaussians)
     """
-    gaussians = gaussians if gaussians.near is None else gaussians.select(gaussians.near)
+    if gaussians.near is not None:
+        gaussians = gaussians.select(gaussians.near)
     return gaussians.replace(sigma_d=None, growth_d=None, attenuation=None)
+
+
+def _stored(values: Tensor) -> Tensor:
+    return values.detach().float().cpu().clone()
 
 
 def _update(name: str, old: Tensor, new: Tensor) -> Tensor:

@@ -129,7 +129,7 @@ def test_other_input_is_refused():
     infinite = base.replace(sh0=torch.full((6, 1, 3), torch.inf))
     grown = with_dial(base, full(1.0), growth_d=full(torch.inf))
     for message, call in {
-        "different base.*SHA-256 is bbbb": lambda: adapter.apply(base, "b" * 64),
+        "different base.*SHA-256 bbbb": lambda: adapter.apply(base, "b" * 64),
         "different base.*7 Gaussians, the adapter 6": lambda: adapter.apply(gaussians(7)),
         "different base.*shN": lambda: adapter.apply(gaussians(bands=3)),
         "no sigma_d": lambda: extract(base, base),

@@ -56,9 +56,10 @@ def normalizing_distance(
     plane, or over all where there is none. It is at least the smallest normal number, so that 0 / D
     is 0, and 1 where there are no Gaussians.
     """
-    if config.form == "ours" or len(distances) == 0:
-        value = config.scene_distance if config.form == "ours" else 1.0
-        return torch.full((), value, dtype=distances.dtype, device=distances.device)
+    if config.form == "ours":
+        return distances.new_tensor(config.scene_distance)
+    if len(distances) == 0:
+        return distances.new_tensor(1.0)
     inside = in_frustum(means, camera)
     # Without a selection, for whose size the host would wait for a GPU.
     largest = distances.where(inside | ~inside.any(), 0).max()
@@ -74,17 +75,6 @@ def in_frustum(means: Tensor, camera: Camera) -> Tensor:
     in_columns = (x >= 0) & (x < camera.width * z)
     in_rows = (y >= 0) & (y < camera.height * z)
     return (z > camera.near) & in_columns & in_rows
-
-
-@torch.no_grad()
-def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> float:
-    """``normalizing_distance`` of one camera and centres ``means [N, 3]``, world units, as a number
-    to store.
-    """
-    if config.form == "ours":
-        return config.scene_distance
-    distances = (means - camera.position.to(means)).norm(dim=1)
-    return float(normalizing_distance(distances, means, camera, config))
 
 
 def median_distance(means: Tensor, camera: Camera) -> float:
@@ -103,21 +93,13 @@ def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Vi
     """The viewpoint of a camera that looks at Gaussians with centres ``means [N, 3]``, world
     units.
     """
-    x, y, z = camera.position.to(means).double().tolist()
-    down, look = camera.viewmat[1:3, :3].tolist()
-    return Viewpoint(
-        x,
-        y,
-        z,
-        camera_unit(means, camera, config),
-        look[0],
-        look[1],
-        look[2],
-        -down[0],
-        -down[1],
-        -down[2],
-        fov=2 * math.atan(0.5 * camera.height / float(camera.K[1, 1])),
-    )
+    position = camera.position.to(means)
+    distances = (means - position).norm(dim=1)
+    unit = float(normalizing_distance(distances, means, camera, config))
+    look = camera.viewmat[2, :3].tolist()
+    up = (-camera.viewmat[1, :3]).tolist()
+    fov = 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
+    return Viewpoint(*position.tolist(), unit, *look, *up, fov=fov)
 
 
 def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> Camera:
