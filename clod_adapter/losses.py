@@ -124,14 +124,15 @@ class _FusedLoss(torch.autograd.Function):
         for plane in (planes.x, planes.y):
             # lanes beyond the image; margins of the other planes are not read
             plane[:, :, kernels.PAD + width :] = 0
+        room = np.zeros((workers, kernels.LINES * shape[2]), np.float32)
         sums = np.zeros(workers)
         differences = np.zeros(workers)
         gradient = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
         images = (tensor.detach().contiguous().numpy() for tensor in (image, target))
         threads.run(kernels.to_planes, workers, *images, planes)
-        threads.run(kernels.ssim_slopes, workers, planes, width, sums)
+        threads.run(kernels.ssim_slopes, workers, planes, width, room, sums)
         written = gradient.numpy(), differences
-        threads.run(kernels.loss_gradient, workers, planes, width, l1, dssim, *written)
+        threads.run(kernels.loss_gradient, workers, planes, width, room, l1, dssim, *written)
         ctx.save_for_backward(gradient)
         difference = float(differences.sum())
         similarity = float(sums.sum())

@@ -4,8 +4,8 @@ from numba import float32, int64
 
 from clod_adapter._kernels.compiling import kernel
 from clod_adapter._kernels.elementary import vsqrt
-from clod_adapter._kernels.pointers import load_where, pointer, scratch, share, store_where
-from clod_adapter._kernels.simd import anywhere, fma, gt, load, splat
+from clod_adapter._kernels.pointers import load, load_where, pointer, scratch, share, store_where
+from clod_adapter._kernels.simd import anywhere, fma, gt, splat
 
 # numbers of sixteen rows: at most the harmonics of degree 3, the highest that Gaussians have
 ROOM = 16 * 45

@@ -34,10 +34,12 @@ from clod_adapter._kernels.conventions import (
 from clod_adapter._kernels.elementary import exp2, lowest, set_spans, vabs
 from clod_adapter._kernels.pointers import (
     count_up,
+    load,
     pointer,
     pointers,
     prefetch,
     scratch,
+    store,
     store_sums,
 )
 from clod_adapter._kernels.simd import (
@@ -46,10 +48,9 @@ from clod_adapter._kernels.simd import (
     fma,
     ge,
     gt,
-    load,
+    lanes,
     select,
     splat,
-    store,
     vmax,
     vmin,
 )
@@ -63,8 +64,8 @@ FORWARD_STATE = BLOCKS * 64
 BACKWARD_STATE = BLOCKS * 80
 BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
-LANE_X = np.tile(np.arange(4, dtype=np.float32) + 0.5, 4)
-LANE_Y = np.repeat(np.arange(4, dtype=np.float32) + 0.5, 4)
+lane_x = lanes(np.tile(np.arange(4) + 0.5, 4))
+lane_y = lanes(np.repeat(np.arange(4) + 0.5, 4))
 LAST = float32(ACROSS - 1)
 
 
@@ -78,7 +79,7 @@ def start_tile(ox, oy, tiles, state, stride, live):
         y = oy + (block // ACROSS) * BLOCK
         if x < tiles.width and y < tiles.height:
             live[block // 64] |= uint64(1) << uint64(block % 64)
-        inside = both(gt(tiles.width - x, load(LANE_X, 0)), gt(tiles.height - y, load(LANE_Y, 0)))
+        inside = both(gt(tiles.width - x, lane_x()), gt(tiles.height - y, lane_y()))
         store(state, block * stride, select(inside, 1, -1))
 
 
@@ -123,8 +124,8 @@ def spread(records, r, ox, oy):
         splat(-records[r + QB]),
         splat(-records[r + QC]),
         splat(records[r + LOG]),
-        load(LANE_X, 0) + (float32(ox) - records[r + MX]),
-        load(LANE_Y, 0) + (float32(oy) - records[r + MY]),
+        lane_x() + (float32(ox) - records[r + MX]),
+        lane_y() + (float32(oy) - records[r + MY]),
         splat(records[r + RED]),
         splat(records[r + GREEN]),
         splat(records[r + BLUE]),
@@ -249,35 +250,22 @@ def read_tile(ox, oy, tiles, picture, gradients, state):
     """
     width = tiles.width
     height = tiles.height
-    block_values = scratch(float32, 80)
     for block in range(BLOCKS):
         x = ox + BLOCK * (block % ACROSS)
         y = oy + BLOCK * (block // ACROSS)
         at = block * 80
         if x >= width or y >= height:
             continue
-        inside = x + BLOCK <= width and y + BLOCK <= height
         for lane in range(16):
-            if inside or (x + lane % 4 < width and y + lane // 4 < height):
+            if x + lane % 4 < width and y + lane // 4 < height:
                 pixel = (y + lane // 4) * width + x + lane % 4
                 remainder = -gradients.alpha[pixel] * (float32(1) - picture.alpha[pixel])
-                block_values[lane] = remainder
-                for channel in range(3):
+                for channel in range(2, -1, -1):
                     slope = gradients.image[3 * pixel + channel]
                     color = picture.image[3 * pixel + channel]
                     state[at + 32 + 16 * channel + lane] = slope
-                    block_values[16 + 16 * channel + lane] = color
                     remainder += slope * color
                 state[at + 16 + lane] = remainder
-        if inside:  # in vectors: the last bits of the result have always been these
-            behind = load(block_values, 0)
-            for channel in range(2, -1, -1):
-                behind = fma(
-                    load(state, at + 32 + 16 * channel),
-                    load(block_values, 16 + 16 * channel),
-                    behind,
-                )
-            store(state, at + 16, behind)
 
 
 @kernel

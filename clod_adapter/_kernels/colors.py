@@ -140,17 +140,14 @@ def color(first, count, stored, drawing, packed):
         sh_basis(drawing.degree, sh[0], sh[1], sh[2], basis)
         load_rows(stored.sh0, rows, 3, 0, 3, w, 0)
         load_sh(stored.shN, rows, terms, sh)
-        red = 0.5 + basis[0] * w[0]
-        green = 0.5 + basis[0] * w[1]
-        blue = 0.5 + basis[0] * w[2]
-        for k in range(terms):
-            red = fma(basis[k + 1], sh[3 * k], red)
-            green = fma(basis[k + 1], sh[3 * k + 1], green)
-            blue = fma(basis[k + 1], sh[3 * k + 2], blue)
-        finite = bits_of(gt(HUGE, vabs(red) + vabs(green) + vabs(blue)))
-        w[0] = vmax(red, 0)
-        w[1] = vmax(green, 0)
-        w[2] = vmax(blue, 0)
+        total = splat(0)
+        for channel in range(3):
+            value = 0.5 + basis[0] * w[channel]
+            for k in range(terms):
+                value = fma(basis[k + 1], sh[3 * k + channel], value)
+            total += vabs(value)
+            w[channel] = vmax(value, 0)
+        finite = bits_of(gt(HUGE, total))
         store_rows(records, targets, RECORD, RED, 3, w, 0)
         for at in range(start, min(start + 16, end)):
             if (finite >> uint64(at - start)) & uint64(1):

@@ -17,11 +17,9 @@ from clod_adapter._kernels.simd import (
     VECTOR,
     call_llvm,
     f32x16,
-    load,
     mask16,
     operation,
     spread,
-    store,
 )
 
 I32 = ir.IntType(32)
@@ -105,6 +103,18 @@ def _vector_at(builder, values, *indices):
     for index in indices:
         values = builder.gep(values, [index])
     return builder.bitcast(values, VECTOR.as_pointer())
+
+
+@operation(f32x16, FLOATS, types.int64)
+def load(builder, values, index):
+    """``values[index : index + 16]``."""
+    return builder.load(_vector_at(builder, values, index), align=4)
+
+
+@operation(types.none, FLOATS, types.int64, f32x16)
+def store(builder, values, index, vector):
+    """``values[index : index + 16] = vector``."""
+    builder.store(vector, _vector_at(builder, values, index), align=4)
 
 
 def _masked_load(builder, address, mask):

@@ -67,13 +67,14 @@ from clod_adapter._kernels.dial import drawn, kept
 from clod_adapter._kernels.elementary import bits_of, log2, lowest, vceil, vfloor, vsqrt
 from clod_adapter._kernels.pointers import (
     first_lanes,
+    load,
     load_rows,
     pointers,
     scratch,
     share,
     store_rows,
 )
-from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, vmin
+from clod_adapter._kernels.simd import both, f32x16, ge, gt, splat, vmax, vmin
 
 
 @inlined

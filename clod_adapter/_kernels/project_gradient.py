@@ -38,9 +38,18 @@ from clod_adapter._kernels.conventions import (
     WORKSPACE,
 )
 from clod_adapter._kernels.dial import dial_gradient, drawn
-from clod_adapter._kernels.pointers import load_rows, pointer, pointers, scratch, share, store_rows
+from clod_adapter._kernels.pointers import (
+    load,
+    load_rows,
+    pointer,
+    pointers,
+    scratch,
+    share,
+    store,
+    store_rows,
+)
 from clod_adapter._kernels.project import covariance, load_stored
-from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
+from clod_adapter._kernels.simd import eq, f32x16, gt, select, splat, vmax, vmin
 
 
 @inlined
@@ -56,51 +65,31 @@ def covariance_gradient(w, g, cam, compensated):
     for k in range(3):
         p0 = w[PMAT + k]
         p1 = w[PMAT + 3 + k]
-        t0 = cam[BLUR] * p0
-        t1 = cam[BLUR] * p1
+        adjugate0 = adjugate1 = splat(0)  # column of adj(P P^T) P
         for j in range(3):
             if j != k:  # else it is 0, except for the rounding of a fused product
                 cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
-                t0 += w[PMAT + 3 + j] * cross
-                t1 -= w[PMAT + j] * cross
-        t0 = t0 * idet
-        t1 = t1 * idet
+                adjugate0 += w[PMAT + 3 + j] * cross
+                adjugate1 -= w[PMAT + j] * cross
+        t0 = (adjugate0 + cam[BLUR] * p0) * idet
+        t1 = (adjugate1 + cam[BLUR] * p1) * idet
         m0 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1
         m1 = g[SUMS + 7] * t0 + g[SUMS + 8] * t1
         g[V_P + k] = a * m0 + b * m1
         g[V_P + 3 + k] = b * m0 + e * m1
         if compensated is not None:
-            compensation_gradient(w, g, k, t0, t1)
+            # that of the logarithm of the compensation is (P P^T)^-1 P - K P
+            inverse = 1 / w[RAWDET]
+            g[V_P + k] += g[SUMS + 3] * (adjugate0 * inverse - t0)
+            g[V_P + 3 + k] += g[SUMS + 3] * (adjugate1 * inverse - t1)
         g[V_SCALE + k] = splat(0)
         for d in range(3):
             v = w[UMAT + d] * g[V_P + k] + w[UMAT + 3 + d] * g[V_P + 3 + k]
-            g[V_SCALE + k] = g[V_SCALE + k] + v * w[ROT + 3 * d + k]
+            g[V_SCALE + k] += v * w[ROT + 3 * d + k]
             g[V_ROT + 3 * d + k] = v * w[SCALE + k]
     v_x = a * g[SUMS + 4] + b * g[SUMS + 5]
     v_y = b * g[SUMS + 4] + e * g[SUMS + 5]
     point_gradient(w, g, v_x, v_y, cam)
-
-
-@inlined
-def compensation_gradient(w, g, k, t0, t1):
-    """Adds the gradient through the compensation c to column k of P: that of log c is
-    ``(P P^T)^-1 P - K P``.
-
-    ``t0, t1`` is the column of K P. The gradient with respect to log c equals that with respect to
-    log opacity.
-    """
-    p0 = w[PMAT + k]
-    p1 = w[PMAT + 3 + k]
-    u0 = splat(0)
-    u1 = splat(0)
-    inverse = 1 / w[RAWDET]
-    for j in range(3):
-        if j != k:
-            cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
-            u0 = u0 + w[PMAT + 3 + j] * cross
-            u1 = u1 - w[PMAT + j] * cross
-    g[V_P + k] = g[V_P + k] + g[SUMS + 3] * (u0 * inverse - t0)
-    g[V_P + 3 + k] = g[V_P + 3 + k] + g[SUMS + 3] * (u1 * inverse - t1)
 
 
 @inlined
@@ -120,12 +109,12 @@ def point_gradient(w, g, v_x, v_y, cam):
         u0 = u1 = splat(0)
         for k in range(3):
             q = w[ROT + 3 * d + k] * w[SCALE + k]
-            u0 = u0 + g[V_P + k] * q
-            u1 = u1 + g[V_P + 3 + k] * q
-        j00 = j00 + u0 * cam[d]
-        j02 = j02 + u0 * cam[8 + d]
-        j11 = j11 + u1 * cam[4 + d]
-        j12 = j12 + u1 * cam[8 + d]
+            u0 += g[V_P + k] * q
+            u1 += g[V_P + 3 + k] * q
+        j00 += u0 * cam[d]
+        j02 += u0 * cam[8 + d]
+        j11 += u1 * cam[4 + d]
+        j12 += u1 * cam[8 + d]
     fx = cam[FX] * iz
     fy = cam[FY] * iz
     # The projected centre, then the factor 1/z of all four entries of the Jacobian.
@@ -138,7 +127,7 @@ def point_gradient(w, g, v_x, v_y, cam):
     v_y = fy * v_y + v_ry
     v_z = v_z - v_rx * rx - v_ry * ry
     for d in range(3):
-        g[V_MEAN + d] = g[V_MEAN + d] + (cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z)
+        g[V_MEAN + d] += cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z
 
 
 @inlined
@@ -155,15 +144,15 @@ def quat_gradient(w, g):
     xy = g[r + 3] + g[r + 1]
     xz = g[r + 6] + g[r + 2]
     yz = g[r + 7] + g[r + 5]
-    v0 = 2 * (q1 * x + q2 * y + q3 * z)
-    v1 = 2 * (q2 * xy + q3 * xz + q0 * x - 2 * q1 * (g[r + 4] + g[r + 8]))
-    v2 = 2 * (q1 * xy + q3 * yz + q0 * y - 2 * q2 * (g[r] + g[r + 8]))
-    v3 = 2 * (q1 * xz + q2 * yz + q0 * z - 2 * q3 * (g[r] + g[r + 4]))
-    along = v0 * q0 + v1 * q1 + v2 * q2 + v3 * q3
-    g[V_QUAT] = (v0 - along * q0) * w[QINV]
-    g[V_QUAT + 1] = (v1 - along * q1) * w[QINV]
-    g[V_QUAT + 2] = (v2 - along * q2) * w[QINV]
-    g[V_QUAT + 3] = (v3 - along * q3) * w[QINV]
+    g[V_QUAT] = 2 * (q1 * x + q2 * y + q3 * z)
+    g[V_QUAT + 1] = 2 * (q2 * xy + q3 * xz + q0 * x - 2 * q1 * (g[r + 4] + g[r + 8]))
+    g[V_QUAT + 2] = 2 * (q1 * xy + q3 * yz + q0 * y - 2 * q2 * (g[r] + g[r + 8]))
+    g[V_QUAT + 3] = 2 * (q1 * xz + q2 * yz + q0 * z - 2 * q3 * (g[r] + g[r + 4]))
+    along = splat(0)
+    for k in range(4):
+        along += g[V_QUAT + k] * w[QUAT + k]
+    for k in range(4):
+        g[V_QUAT + k] = (g[V_QUAT + k] - along * w[QUAT + k]) * w[QINV]
 
 
 @inlined
@@ -177,18 +166,14 @@ def color_gradient(w, g, shN, rows, drawing, sh, basis, tuned, v_shN):
     y = sh[1]
     z = sh[2]
     sh_basis(degree, x, y, z, basis)
-    red = g[SUMS]
-    green = g[SUMS + 1]
-    blue = g[SUMS + 2]
     terms = (degree + 1) * (degree + 1) - 1
     load_sh(shN, rows, terms, sh)
     for k in range(terms):
-        b = basis[k + 1]
-        at = 3 * k
-        basis[k + 1] = sh[at] * red + sh[at + 1] * green + sh[at + 2] * blue
-        sh[at] = b * red
-        sh[at + 1] = b * green
-        sh[at + 2] = b * blue
+        along_basis = splat(0)
+        for channel in range(3):
+            along_basis += sh[3 * k + channel] * g[SUMS + channel]
+            sh[3 * k + channel] = basis[k + 1] * g[SUMS + channel]
+        basis[k + 1] = along_basis
     if tuned:
         for first in range(0, 3 * terms, 16):
             store_rows(v_shN, rows, 3 * terms, first, min(3 * terms - first, 16), sh, first)

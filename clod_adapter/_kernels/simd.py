@@ -1,8 +1,6 @@
 """Sixteen-lane float vectors for Numba, as LLVM vectors.
 
-LLVM lowers ``<16 x float>`` to one AVX-512, two AVX or four SSE/NEON registers. Loads and stores
-take a contiguous float32 array or a pointer, and the index of the first lane; bounds are not
-checked.
+LLVM lowers ``<16 x float>`` to one AVX-512, two AVX or four SSE/NEON registers.
 """
 
 import operator
@@ -39,39 +37,6 @@ mask16 = _vector_type("Mask16", MASK)
 def call_llvm(builder, name, result, arguments):
     kind = ir.FunctionType(result, [a.type for a in arguments])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
-
-
-def _pointer(context, builder, kind, value, index):
-    data = (
-        value
-        if isinstance(kind, types.CPointer)
-        else context.make_array(kind)(context, builder, value).data
-    )
-    return builder.bitcast(builder.gep(data, [index]), VECTOR.as_pointer())
-
-
-@intrinsic
-def load(typingctx, array, index):
-    """``array[index : index + 16]``."""
-
-    def codegen(context, builder, signature, args):
-        return builder.load(
-            _pointer(context, builder, signature.args[0], args[0], args[1]), align=4
-        )
-
-    return f32x16(array, types.intp), codegen
-
-
-@intrinsic
-def store(typingctx, array, index, value):
-    """``array[index : index + 16] = value``."""
-
-    def codegen(context, builder, signature, args):
-        pointer = _pointer(context, builder, signature.args[0], args[0], args[1])
-        builder.store(args[2], pointer, align=4)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, f32x16), codegen
 
 
 def spread(builder, value, kind=VECTOR):
@@ -157,6 +122,11 @@ def llvm_function(name, count):
     return operation(f32x16, *[f32x16] * count)(
         lambda builder, *args: call_llvm(builder, f"llvm.{name}.v16f32", VECTOR, args)
     )
+
+
+def lanes(values):
+    """A function that returns the vector of sixteen numbers."""
+    return operation(f32x16)(lambda builder: ir.Constant(VECTOR, list(map(float, values))))
 
 
 # Sixteen copies of a number.

@@ -11,11 +11,12 @@ import numpy as np
 from numba import float32
 
 from clod_adapter._kernels.compiling import inlined, kernel
-from clod_adapter._kernels.pointers import pointers, share
-from clod_adapter._kernels.simd import fma, load, splat, store
+from clod_adapter._kernels.pointers import load, pointer, pointers, share, store
+from clod_adapter._kernels.simd import fma, splat
 
 RADIUS = 5
 PAD = 16
+LINES = 6
 _taps = np.exp(-((np.arange(11) - RADIUS) ** 2) / (2 * 1.5**2))
 TAPS = (_taps / _taps.sum()).astype(np.float32)
 C1 = float32(0.01**2)
@@ -61,13 +62,15 @@ def blur_row(lines, line, length):
 
 
 @kernel
-def ssim_slopes(worker, workers, planes, width, sums):
+def ssim_slopes(worker, workers, planes, width, room, sums):
     """Derivatives of each pixel's SSIM by the blurred x, x^2 and x y; ``sums[worker]``: sum of SSIM
     over the pixels.
+
+    ``room[worker]`` holds LINES zeroed rows of scratch.
     """
     channels, height, step = planes.x.shape
     planes = pointers(planes)
-    lines = np.zeros(6 * step, np.float32)
+    lines = pointer(room[worker])
     zero = splat(0)
     result = 0.0
     for task in range(*share(worker, workers, channels * height)):
@@ -118,14 +121,13 @@ def ssim_slopes(worker, workers, planes, width, sums):
 
 
 @kernel
-def loss_gradient(worker, workers, planes, width, l1, dssim, v_image, sums):
+def loss_gradient(worker, workers, planes, width, room, l1, dssim, v_image, sums):
     """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` by x, as ``[H, W, 3]``; ``sums[worker]``: sum
     of |x - y|.
     """
     channels, height, step = planes.x.shape
     planes = pointers(planes)
-    lines = np.zeros(3 * step, np.float32)
-    out = np.empty(step, np.float32)
+    lines = pointer(room[worker])
     zero = splat(0)
     weight = float32(-dssim)
     result = 0.0
@@ -150,14 +152,12 @@ def loss_gradient(worker, workers, planes, width, l1, dssim, v_image, sums):
             inner = fma(
                 2 * load(planes.x, where), blur_row(lines, step, at), blur_row(lines, 0, at)
             )
-            store(
-                out, at, weight * fma(load(planes.y, where), blur_row(lines, 2 * step, at), inner)
-            )
+            slope = weight * fma(load(planes.y, where), blur_row(lines, 2 * step, at), inner)
+            store(lines, 3 * step + at, slope)
         for column in range(width):
             pixel = task * step + PAD + column
             difference = planes.x[pixel] - planes.y[pixel]
             result += abs(difference)
-            v_image[row, column, channel] = out[PAD + column] + float32(l1) * float32(
-                np.sign(difference)
-            )
+            slope = lines[3 * step + PAD + column]
+            v_image[row, column, channel] = slope + float32(l1) * float32(np.sign(difference))
     sums[worker] = result

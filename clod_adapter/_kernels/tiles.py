@@ -23,10 +23,10 @@ from clod_adapter._kernels.conventions import (
     Y1,
 )
 from clod_adapter._kernels.elementary import vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import pointer, prefetch, scratch, share
-from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, store, vmax, vmin
+from clod_adapter._kernels.pointers import load, pointer, prefetch, scratch, share, store
+from clod_adapter._kernels.simd import both, eq, ge, lanes, select, splat, vmax, vmin
 
-ROWS = np.arange(16, dtype=np.float32)
+lane_numbers = lanes(range(16))
 
 
 @inlined
@@ -44,7 +44,7 @@ def spans(records, r, ox, oy, side):
     qa = records[r + QA]
     qb = records[r + QB]
     qc = records[r + QC]
-    row = load(ROWS, 0) * side + (float32(oy) + 0.5)
+    row = lane_numbers() * side + (float32(oy) + 0.5)
     top = vmax(row, records[r + Y0] + 0.5) - my
     bottom = vmin(row + (side - 1), records[r + Y1] + 0.5) - my
     tip = splat(-qb / (qc * float32(2)) * rx)
@@ -66,13 +66,17 @@ def spans(records, r, ox, oy, side):
 
 
 @kernel
-def depth_order(depths, counts, keys, order, keys_other, order_other):
+def depth_order(depths, counts):
     """The packed records, near ones first: a radix sort of positive floats by their bits, 11 at a
     time.
 
-    Worker w packed the first ``counts[w]`` of its part of ``depths [N]``, as uint32; the others are
-    scratch.
+    Worker w packed the first ``counts[w]`` of its part of ``depths [N]``, as uint32.
     """
+    total = counts.sum()
+    keys = np.empty(total, np.uint32)
+    keys_other = np.empty(total, np.uint32)
+    order = np.empty(total, np.int32)
+    order_other = np.empty(total, np.int32)
     digits = np.zeros((3, 2048), np.int64)
     n = 0
     for worker in range(len(counts)):
@@ -85,9 +89,9 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):
             for place in range(3):
                 digits[place, (key >> np.uint32(11 * place)) & np.uint32(2047)] += 1
     for place in range(3):
-        total = 0
+        start = 0
         for digit in range(2048):
-            total, digits[place, digit] = total + digits[place, digit], total
+            start, digits[place, digit] = start + digits[place, digit], start
         for i in range(n):
             digit = (keys[i] >> np.uint32(11 * place)) & np.uint32(2047)
             keys_other[digits[place, digit]] = keys[i]
@@ -119,28 +123,13 @@ def tiles_across(records, r, ty, y0, y1, columns):
 
 
 @kernel
-def tile_offsets(histogram, offsets, totals):
-    """Turns the counts into offsets; returns the number of entries."""
-    total = 0
-    for tile in range(histogram.shape[1]):
-        offsets[tile] = total
-        for worker in range(histogram.shape[0]):
-            total, histogram[worker, tile] = total + histogram[worker, tile], total
-    offsets[histogram.shape[1]] = total
-    slot = 0
-    for worker in range(len(totals)):
-        slot, totals[worker] = slot + totals[worker], slot
-    return total
-
-
-@kernel
 def list_tiles(
     worker, workers, records, order, across, histogram, totals, slots, entries, entry_slots
 ):
     """Counts this worker's Gaussians per tile (its row of the histogram) and pairs of Gaussian and
     tile (its total).
 
-    With ``slots``, from the offsets that ``tile_offsets`` makes of these: writes each tile's
+    With ``slots``, from the first entries and slots of each in place of these counts: writes each tile's
     Gaussians in depth order, and the slot that receives the pair's gradient. ``slots[2 p]`` to
     ``slots[2 p + 1]`` are those of the record p.
     """

@@ -92,16 +92,20 @@ class ForwardState:
             np.zeros(workers, np.int64),
         )
         threads.run(project, workers, stored, self.drawing, self.packed)
-        order = self._depth_order()
+        order = tiles.depth_order(self.packed.depths.view(np.uint32), self.packed.counts)
         across = -(-camera.width // conventions.TILE)
         down = -(-camera.height // conventions.TILE)
-        offsets = np.empty(across * down + 1, np.int64)
         listing = workers_for(len(order))
         histogram = np.zeros((listing, across * down), np.int64)
         totals = np.zeros(listing, np.int64)
         listed = self.packed.records, order, across, histogram, totals
         threads.run(tiles.list_tiles, listing, *listed, *[np.empty(0, np.int32)] * 3)
-        total = tiles.tile_offsets(histogram, offsets, totals)
+        # from counts to first entries, tile by tile and in a tile worker by worker
+        ends = histogram.T.cumsum().reshape(-1, listing)
+        histogram[:] = ends.T - histogram
+        totals[:] = totals.cumsum() - totals
+        offsets = np.append(0, ends[:, -1])
+        total = int(offsets[-1])
         self.slots = recycled_array((2 * n,), np.int32)
         entries = recycled_array((total,), np.int32)
         self.entry_slots = recycled_array((total,), np.int32)
@@ -117,14 +121,6 @@ class ForwardState:
             camera.width,
             camera.height,
         )
-
-    def _depth_order(self) -> np.ndarray:
-        """The packed records, near ones first."""
-        count = int(self.packed.counts.sum())
-        keys, keys_other = (recycled_array((count,), np.uint32) for _ in range(2))
-        order, order_other = (recycled_array((count,), np.int32) for _ in range(2))
-        depths = self.packed.depths.view(np.uint32)
-        return tiles.depth_order(depths, self.packed.counts, keys, order, keys_other, order_other)  # type: ignore[no-any-return]
 
     def blend(self, background: np.ndarray) -> tuple[Tensor, Tensor]:
         """The image and its alpha."""
