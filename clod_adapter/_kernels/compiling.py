@@ -8,8 +8,6 @@ from typing import Any
 
 from numba import config, njit
 from numba.core.caching import FunctionCache, IndexDataCacheFile
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
 from clod_adapter.errors import ClodError
 
@@ -70,33 +68,4 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             super().save_overload(sig, data)
 
 
-class _Inlined(JITCodeLibrary):  # type: ignore[misc]
-    """Code that is optimized and compiled only where kernels inline it, in half the time."""
-
-    codegen = property(lambda self: self)
-
-    def set_env(self, *_: Any) -> None:
-        """Nothing: the interpreter does not call it."""
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        self._finalized = True
-
-    def get_pointer_to_function(self, _name: str) -> int:
-        self._ensure_finalized()
-        return 0
-
-
-class _Inlining(CompilerBase):  # type: ignore[misc]
-    def define_pipelines(self) -> Any:
-        self.state.library = _Inlined(
-            self.state.targetctx.codegen(), self.state.func_id.func_qualname
-        )
-        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
-
-
-# Always inlined: a call would pass seven words on the stack per array. Only kernels call it: Python
-# would crash.
-inlined = njit(forceinline=True, no_cpython_wrapper=True, pipeline_class=_Inlining, **OPTIONS)  # type: ignore[call-overload]
+inlined = njit(forceinline=True, no_cpython_wrapper=True, **OPTIONS)

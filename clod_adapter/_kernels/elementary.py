@@ -93,7 +93,7 @@ def set_spans(builder, words, index, low, high):
 bits_of = operation(types.uint64, mask16)(
     lambda builder, mask: builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(64))
 )
-# The number of bits that are set in a uint64, and the index of the lowest that is, if any.
-_count = operation(types.int64, types.uint64)
-ones = _count(lambda builder, bits: builder.ctpop(bits))
-lowest = _count(lambda builder, bits: builder.cttz(bits, ir.Constant(ir.IntType(1), 1)))
+# The index of the lowest bit that is set in a uint64, if any.
+lowest = operation(types.int64, types.uint64)(
+    lambda builder, bits: builder.cttz(bits, ir.Constant(ir.IntType(1), 1))
+)

@@ -23,7 +23,7 @@ from clod_adapter._kernels.conventions import (
     Y1,
 )
 from clod_adapter._kernels.elementary import vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import load, pointer, prefetch, scratch, share, store
+from clod_adapter._kernels.pointers import pointer, prefetch, scratch, share, store
 from clod_adapter._kernels.simd import both, eq, ge, lanes, select, splat, vmax, vmin
 
 lane_numbers = lanes(range(16))
@@ -129,9 +129,9 @@ def list_tiles(
     """Counts this worker's Gaussians per tile (its row of the histogram) and pairs of Gaussian and
     tile (its total).
 
-    With ``slots``, from the first entries and slots of each in place of these counts: writes each tile's
-    Gaussians in depth order, and the slot that receives the pair's gradient. ``slots[2 p]`` to
-    ``slots[2 p + 1]`` are those of the record p.
+    With ``slots``, and the first entry and slot in place of each of these counts: writes each
+    tile's Gaussians in depth order, and the slot that receives the pair's gradient. ``slots[2 p]``
+    to ``slots[2 p + 1]`` are those of the record p.
     """
     first, last = share(worker, workers, len(order))
     listed = len(slots) > 0

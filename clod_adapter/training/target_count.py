@@ -2,7 +2,6 @@
 enforces it.
 """
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -56,28 +55,25 @@ def count_gradient(
     scenes and dial values that are fitted well or badly. Where too few are kept, culled Gaussians
     are brought back: with a slope of at least ``LIFT SHARPNESS / N``.
     """
+    n = len(sigma_d)
+    far = distances * virtual_scale
+    keep = far < sigma_d
+    eta = keep.sum().double() / n  # a tensor: a float would wait for a GPU
+    penalty = _penalty(eta, target, loss, config)
     if any(x.device.type != "cpu" or x.dtype != torch.float32 for x in (sigma_d, distances)):
-        far = distances * virtual_scale
-        keep = far < sigma_d
-        eta = keep.sum().double() / len(sigma_d)  # a tensor: a float would wait for a GPU
-        penalty = _penalty(eta, target, loss, config)
         slope = count_slope(far, sigma_d)
-        least = (torch.as_tensor(penalty < 0) & ~keep) * (LIFT * SHARPNESS / len(slope))
+        least = (torch.as_tensor(penalty < 0) & ~keep) * (LIFT * SHARPNESS / n)
         return slope.clamp_(min=least).mul_(penalty)
-    # The same in two compiled passes.
+    # The same in one compiled pass.
     from clod_adapter._kernels import count, threads
     from clod_adapter.rasterizers.cpu import workers_for
 
     out = torch.empty_like(sigma_d, memory_format=torch.contiguous_format)
-    n = len(out)
-    workers = workers_for(len(out))
     arrays = [x.detach().contiguous().numpy() for x in (sigma_d, distances)]
+    lift = LIFT if penalty < 0 else 0.0
+    scale = SHARPNESS * float(penalty) / n
     square = virtual_scale**2
-    counts = np.zeros(workers, np.int64)
-    threads.run(count.count_kept, workers, *arrays, square, counts)
-    penalty = float(_penalty(float(counts.sum()) / n, target, loss, config))
-    scale = LIFT if penalty < 0 else 0.0, SHARPNESS * penalty / n
-    threads.run(count.count_slope, workers, *arrays, square, *scale, out.numpy())
+    threads.run(count.count_slope, workers_for(n), *arrays, square, lift, scale, out.numpy())
     return out
 
 
