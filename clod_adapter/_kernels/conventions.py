@@ -108,8 +108,8 @@ class Stored(NamedTuple):
     opacities: Any  # [N]
     sigma: Any  # [N]
     growth: Any  # [N]
-    sh0: Any  # flat, 3 N
-    shN: Any  # flat, as sh0
+    sh0: Any  # [N, 1, 3]
+    shN: Any  # [N, K - 1, 3]
 
 
 class Drawing(NamedTuple):

@@ -197,13 +197,10 @@ def _addresses(builder, table, rows, width, first):
     return [_vector_at(builder, table, builder.mul(row, width), first) for row in numbers]
 
 
-def _lanes(builder, lanes, at, count=LANES):
-    """The addresses of ``count`` vectors from ``lanes[at]`` on."""
-    addresses = []
-    for k in range(count):
-        index = builder.add(at, ir.Constant(I64, k))
-        addresses.append(builder.gep(lanes, [index]))
-    return addresses
+def _lanes(builder, lanes, at):
+    """The addresses of sixteen vectors from ``lanes[at]`` on."""
+    first = builder.gep(lanes, [at])
+    return [builder.gep(first, [ir.Constant(I64, k)]) for k in range(LANES)]
 
 
 @operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
@@ -230,42 +227,28 @@ def store_rows(builder, destination, rows, width, first, count, lanes, at):
         _masked_store(builder, address, mask, row)
 
 
-@operation(types.none, VECTORS)
-def _split_triples(builder, lanes):
-    """Makes vectors of the first, the second and the third numbers of sixteen triples in three
-    vectors.
-    """
-    addresses = _lanes(builder, lanes, ir.Constant(I64, 0), 3)
-    a, b, c = (builder.load(x, align=4) for x in addresses)
-    for k, address in enumerate(addresses):
-        order = range(k, 3 * LANES, 3)
-        # Lanes of a and b first; those of c, from 32 on, take the places that are left.
-        two = builder.shuffle_vector(
-            a, b, ir.Constant(INTEGERS, [min(o, 2 * LANES - 1) for o in order])
-        )
-        sources = [lane if o < 2 * LANES else o - LANES for lane, o in enumerate(order)]
-        builder.store(
-            builder.shuffle_vector(two, c, ir.Constant(INTEGERS, sources)), address, align=4
-        )
-
-
 @inlined
 def load_triples(source, row, count, lanes):
-    """``lanes[k]`` = column k of ``count`` <= 16 consecutive rows of ``source [*, 3]``, then 0."""
+    """``lanes[k]`` = column k of ``count`` <= 16 consecutive rows of ``source [*, 3]``; the last
+    one repeated.
+    """
+    columns = scratch(float32, 48)
+    for lane in range(16):
+        start = 3 * (row + min(lane, count - 1))
+        for k in range(3):
+            columns[16 * k + lane] = source[start + k]
     for k in range(3):
-        lanes[k] = load_some(source, 3 * row + 16 * k, 3 * count - 16 * k)
-    _split_triples(lanes)
+        lanes[k] = load(columns, 16 * k)
 
 
 @operation(types.none, FLOATS, types.int64, *[f32x16] * 9)
 def store_sums(builder, values, index, *summands):
     """``values[index : index + 9]`` = the sums over the lanes of the nine vectors."""
-    vectors = list(summands)
     nine = _first(builder, ir.Constant(I64, len(summands)))
     even = ir.Constant(INTEGERS, list(range(0, 2 * LANES, 2)))
     odd = ir.Constant(INTEGERS, list(range(1, 2 * LANES, 2)))
+    vectors = [*summands, *[summands[-1]] * (LANES - len(summands))]
     while len(vectors) > 1:  # adds neighbouring lanes until one vector holds all the sums, in order
-        vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors
         pairs = zip(vectors[::2], vectors[1::2], strict=True)
         vectors = [
             builder.fadd(builder.shuffle_vector(a, b, even), builder.shuffle_vector(a, b, odd))

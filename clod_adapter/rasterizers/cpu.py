@@ -3,7 +3,7 @@ threads.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -76,12 +76,11 @@ class ForwardState:
     ) -> None:
         n = len(stored.means)
         workers = workers_for(n)
-        terms = len(stored.shN) // max(3 * n, 1)
         self.compensated = screen_filter.compensate or None
         self.drawing = Drawing(
             camera_vector(camera, screen_filter),
             dial,
-            degree=math.isqrt(terms + 1) - 1,
+            degree=math.isqrt(stored.shN.shape[1] + 1) - 1,
             fades=len(stored.sigma) > 0,
             grows=len(stored.growth) > 0,
         )
@@ -150,11 +149,9 @@ class ForwardState:
         threads.run(kernel, workers, self.tiles, np.zeros(1, np.int64), room, *arguments)
 
 
-def _arrays(tensors: Iterable[Tensor]) -> Iterator[np.ndarray]:
-    """Contiguous float32 arrays; those of harmonics flat."""
-    for tensor in tensors:
-        array = tensor.detach().contiguous().numpy()
-        yield array.reshape(-1) if array.ndim == 3 else array
+def _arrays(tensors: Iterable[Tensor]) -> list[np.ndarray]:
+    """Contiguous float32 arrays."""
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 
 class _Picture(torch.autograd.Function):

@@ -74,22 +74,11 @@ def project(
 def rotations(quats: Tensor) -> Tensor:
     """``[n, 3, 3]`` the matrices of quaternions wxyz of any length above 0."""
     unit_quats = quats / quats.norm(dim=1, keepdim=True)
-    w, *axis = unit_quats.unbind(1)
-    x, y, z = axis
-    return torch.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
-        ],
-        1,
-    ).reshape(-1, 3, 3)
+    w = unit_quats[:, :1, None]
+    identity = torch.eye(3).to(quats)
+    # multiplies by the axis: axis x v
+    cross = torch.linalg.cross(unit_quats[:, 1:, None], identity[None], dim=1)
+    return identity + 2 * (w * cross + cross @ cross)
 
 
 def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tuple[Tensor, Tensor]:
