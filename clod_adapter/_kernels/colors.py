@@ -5,7 +5,7 @@ Gaussians at a time.
 from numba import float32, int64, uint64
 
 from clod_adapter._kernels.compiling import inlined
-from clod_adapter._kernels.conventions import EYE, HUGE, MEAN, RECORD, RED
+from clod_adapter._kernels.conventions import HUGE, MEAN, RECORD, RED
 from clod_adapter._kernels.elementary import bits_of, vabs, vsqrt
 from clod_adapter._kernels.pointers import load_rows, scratch, store_rows
 from clod_adapter._kernels.simd import f32x16, fma, gt, splat, vmax
@@ -94,11 +94,11 @@ def sh_basis_gradient(degree, x, y, z, v):
 
 
 @inlined
-def view_direction(w, cam, out):
+def view_direction(w, drawing, out):
     """Unit directions from the camera to the Gaussians into ``out[:3]``; returns 1 / distance."""
-    x = w[MEAN] - cam[EYE]
-    y = w[MEAN + 1] - cam[EYE + 1]
-    z = w[MEAN + 2] - cam[EYE + 2]
+    x = w[MEAN] - drawing.eye[0]
+    y = w[MEAN + 1] - drawing.eye[1]
+    z = w[MEAN + 2] - drawing.eye[2]
     inverse = 1 / vsqrt(x * x + y * y + z * z)
     out[0] = x * inverse
     out[1] = y * inverse
@@ -136,7 +136,7 @@ def color(first, count, stored, drawing, packed):
             targets[lane] = min(start + lane, end - 1)
             rows[lane] = ids[targets[lane]]
         load_rows(stored.means, rows, 3, 0, 3, w, MEAN)
-        view_direction(w, drawing.cam, sh)
+        view_direction(w, drawing, sh)
         sh_basis(drawing.degree, sh[0], sh[1], sh[2], basis)
         load_rows(stored.sh0, rows, 3, 0, 3, w, 0)
         load_sh(stored.shN, rows, terms, sh)

@@ -68,4 +68,4 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             super().save_overload(sig, data)
 
 
-inlined = njit(forceinline=True, no_cpython_wrapper=True, **OPTIONS)
+inlined = njit(forceinline=True, no_cpython_wrapper=True, **OPTIONS)  # type: ignore[call-overload]

@@ -1,5 +1,5 @@
-"""Constants of gsplat's conventions, the kernels' arguments, and the layouts of records, cameras
-and workspaces.
+"""Constants of gsplat's conventions, the kernels' arguments, and the layouts of records and
+workspaces.
 """
 
 from typing import Any, NamedTuple
@@ -37,25 +37,6 @@ Y0 = 13
 X1 = 14
 Y1 = 15
 RECORD = 16
-
-# A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y,
-# high y, centre in world coordinates (3), near plane; then the screen-space filter: its variance
-# (px^2), and 1 if opacities are compensated for it.
-FX = 16
-FY = 17
-CX = 18
-CY = 19
-WIDTH = 20
-HEIGHT = 21
-LOW_X = 22
-HIGH_X = 23
-LOW_Y = 24
-HIGH_Y = 25
-EYE = 26
-NEAR = 29
-BLUR = 30
-COMPENSATE = 31
-CAMERA = 32
 
 # The workspace of sixteen Gaussians: vectors with one lane per Gaussian. As stored: mean (3),
 # quaternion (4), scales (3). Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6),
@@ -112,14 +93,37 @@ class Stored(NamedTuple):
     shN: Any  # [N, K - 1, 3]
 
 
-class Drawing(NamedTuple):
-    """Settings by which Gaussians are drawn."""
+class Dial(NamedTuple):
+    """A dial value s and its equation, in float32."""
 
-    cam: Any  # a camera, as above
-    dial: Any  # as in ``dial.py``
-    degree: int  # of the spherical harmonics
-    fades: bool  # there is a sigma
-    grows: bool  # there is a growth
+    rate2: Any = float32(0)  # (s / D)^2, 1 / world units^2
+    growth_rate2: Any = float32(0)  # (s / (D r))^2, likewise
+    near2: Any = float32(0)  # 1 / H^2; 0 without near Gaussians
+    activated: bool = False  # scales and opacities are activated, and there is no dial
+
+
+class Drawing(NamedTuple):
+    """Settings by which Gaussians are drawn. Numbers are float32, lengths on the image pixels."""
+
+    viewmat: Any  # flat, row-major
+    eye: Any  # [3] the camera's centre, in the world
+    fx: Any
+    fy: Any
+    cx: Any
+    cy: Any
+    width: Any
+    height: Any
+    low_x: Any  # clamp of the ray
+    high_x: Any
+    low_y: Any
+    high_y: Any
+    near: Any  # the near plane
+    blur: Any  # the screen-space filter's variance
+    compensate: bool  # opacities are compensated for it
+    dial: Dial
+    degree: int = 0  # of the spherical harmonics
+    fades: bool = False  # there is a sigma
+    grows: bool = False  # there is a growth
 
 
 class Packed(NamedTuple):

@@ -10,10 +10,8 @@ from numba import float32, uint64
 from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.conventions import (
     ALPHA_MIN,
-    EYE,
     HUGE,
     LOG2E,
-    NEAR,
     SCALE,
     SUMS,
     V_SCALE,
@@ -25,19 +23,12 @@ from clod_adapter._kernels.pointers import (
     load_some,
     load_triples,
     pointer,
+    pointers,
     scatter,
     scratch,
     share,
 )
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax, vmin
-
-# A dial: (s / D)^2 and (s / (D r))^2, in 1 / world units^2, 1 / H^2 (0 without near Gaussians), and
-# 1 where scales and opacities are activated and there is no dial.
-RATE2 = 0
-GROWTH_RATE2 = 1
-NEAR2 = 2
-ACTIVATED = 3
-DIAL = 4
 
 LN2 = float32(0.6931471805599453)
 TAKEOVER = 12  # attenuation.TAKEOVER
@@ -47,11 +38,17 @@ NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
 
 @inlined
-def squared_distance(w, cam):
+def transformed(view, row, x, y, z):
+    """A coordinate in the camera's axes: that of ``row``, 0, 4 or 8, of the view matrix."""
+    return view[row] * x + view[row + 1] * y + view[row + 2] * z + view[row + 3]
+
+
+@inlined
+def squared_distance(w, drawing):
     """Squared distances from the camera to the centres ``w[:3]``, world units^2."""
-    dx = w[0] - cam[EYE]
-    dy = w[1] - cam[EYE + 1]
-    dz = w[2] - cam[EYE + 2]
+    dx = w[0] - drawing.eye[0]
+    dy = w[1] - drawing.eye[1]
+    dz = w[2] - drawing.eye[2]
     return dx * dx + dy * dy + dz * dz
 
 
@@ -98,37 +95,35 @@ def kept(at, many, stored, drawing):
 
     Activated opacities are 1/255 at least.
     """
-    cam = drawing.cam
     dial = drawing.dial
-    if dial[ACTIVATED] > 0:
+    if dial.activated:
         opacity = load_some(stored.opacities, at, many)
         visible = both(ge(opacity, ALPHA_MIN), gt(HUGE, opacity))
     else:
         w = scratch(f32x16, 3)
         load_triples(stored.means, at, many, w)
-        depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
-        visible = ge(depth, NEARLY * cam[NEAR])
+        depth = transformed(drawing.viewmat, 8, w[0], w[1], w[2])
+        visible = ge(depth, NEARLY * drawing.near)
         if drawing.fades:
-            far2 = squared_distance(w, cam) * dial[RATE2]
-            visible = both(visible, survives(load_some(stored.sigma, at, many), far2, dial[NEAR2]))
+            far2 = squared_distance(w, drawing) * dial.rate2
+            visible = both(visible, survives(load_some(stored.sigma, at, many), far2, dial.near2))
     return bits_of(both(visible, first_lanes(many)))
 
 
 @kernel
-def mark_kept(worker, workers, means, sigma, cam, dial, out):
+def mark_kept(worker, workers, means, sigma, drawing, out):
     """``out [N]`` uint8: 1 for rows that the dial keeps, in front of the camera or not."""
     first, last = share(worker, workers, len(sigma))
     means = pointer(means)
     sigma = pointer(sigma)
     out = pointer(out)
-    cam = pointer(cam)
-    dial = pointer(dial)
+    drawing = pointers(drawing)
     w = scratch(f32x16, 3)
     for i in range(first, last, 16):
         many = min(last - i, 16)
         load_triples(means, i, many, w)
-        far2 = squared_distance(w, cam) * dial[RATE2]
-        bits = bits_of(survives(load_some(sigma, i, many), far2, dial[NEAR2]))
+        far2 = squared_distance(w, drawing) * drawing.dial.rate2
+        bits = bits_of(survives(load_some(sigma, i, many), far2, drawing.dial.near2))
         for lane in range(many):
             out[i + lane] = (bits >> uint64(lane)) & uint64(1)
 
@@ -143,17 +138,17 @@ def drawn(rows, stored, drawing, w):
     dial = drawing.dial
     opacity = gather(stored.opacities, rows)
     size = splat(0)
-    if dial[ACTIVATED] > 0:
+    if dial.activated:
         return opacity
     opacity = 1 / reciprocal_opacity(opacity)
     if drawing.fades:
-        distance2 = squared_distance(w, drawing.cam)
+        distance2 = squared_distance(w, drawing)
         reach = gather(stored.sigma, rows)
-        far2 = distance2 * dial[RATE2]
+        far2 = distance2 * dial.rate2
         share2 = squared_share(reach, far2)
         fade = 1 - share2 * share2
-        if dial[NEAR2] > 0:
-            takeover_share = vmin(1, vmax(0, takeover(far2, dial[NEAR2])))
+        if dial.near2 > 0:
+            takeover_share = vmin(1, vmax(0, takeover(far2, dial.near2)))
             fade = select(gt(reach, 0), fade * takeover_share, 1 - takeover_share)
         opacity = opacity * fade
         if drawing.grows:
@@ -168,7 +163,7 @@ def drawn(rows, stored, drawing, w):
 @inlined
 def log2_magnification(distance2, dial):
     """``log2 m``, of squared distances in world units^2."""
-    return 0.5 * log2(vmax(distance2 * dial[GROWTH_RATE2], 1))
+    return 0.5 * log2(vmax(distance2 * dial.growth_rate2, 1))
 
 
 @inlined
@@ -188,7 +183,7 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
     """
     dial = drawing.dial
     opacity = gather(stored.opacities, rows)
-    if dial[ACTIVATED] > 0:
+    if dial.activated:
         scatter(gradients.opacities, rows, g[SUMS + 3] / opacity)
         return
     odds = exp2(vmin(-opacity * LOG2E, FARTHEST_EXPONENT))  # (1 - a) / a
@@ -198,8 +193,8 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
             g[k] = g[k] * w[SCALE + k - V_SCALE]
     if drawing.fades:
         reach = gather(stored.sigma, rows)
-        distance2 = squared_distance(w, drawing.cam)
-        share2 = squared_share(reach, distance2 * dial[RATE2])
+        distance2 = squared_distance(w, drawing)
+        share2 = squared_share(reach, distance2 * dial.rate2)
         share4 = share2 * share2
         fading = both(gt(share4, 0), gt(1, share4))
         slope = 4 * share4 / ((1 - share4) * reach)

@@ -13,29 +13,17 @@ from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.conventions import (
     ALPHA_MIN,
     BLUE,
-    BLUR,
-    COMPENSATE,
     COV,
     COVDET,
-    CX,
-    CY,
     DET,
-    FX,
-    FY,
     GREEN,
-    HEIGHT,
-    HIGH_X,
-    HIGH_Y,
     HUGE,
     LOG,
     LOG2_255,
     LOG2E,
-    LOW_X,
-    LOW_Y,
     MEAN,
     MX,
     MY,
-    NEAR,
     PMAT,
     POINT,
     QA,
@@ -56,14 +44,13 @@ from clod_adapter._kernels.conventions import (
     STORED,
     TWO_LN2,
     UMAT,
-    WIDTH,
     WORKSPACE,
     X0,
     X1,
     Y0,
     Y1,
 )
-from clod_adapter._kernels.dial import drawn, kept
+from clod_adapter._kernels.dial import drawn, kept, transformed
 from clod_adapter._kernels.elementary import bits_of, log2, lowest, vceil, vfloor, vsqrt
 from clod_adapter._kernels.pointers import (
     first_lanes,
@@ -86,39 +73,34 @@ def load_stored(stored, rows, w):
 
 
 @inlined
-def covariance(cam, w):
+def covariance(drawing, w):
     """Fills the rest of the workspace ``w``; returns which are in front of the near plane and have
     a rotation.
     """
+    view = drawing.viewmat
     for d in range(3):
-        row = 4 * d
-        w[POINT + d] = (
-            cam[row] * w[MEAN]
-            + cam[row + 1] * w[MEAN + 1]
-            + cam[row + 2] * w[MEAN + 2]
-            + cam[row + 3]
-        )
+        w[POINT + d] = transformed(view, 4 * d, w[MEAN], w[MEAN + 1], w[MEAN + 2])
     norm2 = w[STORED] * w[STORED] + w[STORED + 1] * w[STORED + 1]
     norm2 = norm2 + w[STORED + 2] * w[STORED + 2] + w[STORED + 3] * w[STORED + 3]
     valid = both(ge(norm2, QUAT_MIN2), ge(QUAT_MAX2, norm2))
-    valid = both(ge(w[POINT + 2], cam[NEAR]), valid)
+    valid = both(ge(w[POINT + 2], drawing.near), valid)
     w[QINV] = 1 / vsqrt(norm2)
     for d in range(4):
         w[QUAT + d] = w[STORED + d] * w[QINV]
     rotation(w)
     iz = 1 / w[POINT + 2]
-    rx = vmin(vmax(w[POINT] * iz, cam[LOW_X]), cam[HIGH_X])
-    ry = vmin(vmax(w[POINT + 1] * iz, cam[LOW_Y]), cam[HIGH_Y])
+    rx = vmin(vmax(w[POINT] * iz, drawing.low_x), drawing.high_x)
+    ry = vmin(vmax(w[POINT + 1] * iz, drawing.low_y), drawing.high_y)
     for k in range(3):
-        w[UMAT + k] = cam[FX] * iz * (cam[k] - rx * cam[8 + k])
-        w[UMAT + 3 + k] = cam[FY] * iz * (cam[4 + k] - ry * cam[8 + k])
+        w[UMAT + k] = drawing.fx * iz * (view[k] - rx * view[8 + k])
+        w[UMAT + 3 + k] = drawing.fy * iz * (view[4 + k] - ry * view[8 + k])
     for row in range(2):
         u = UMAT + 3 * row
         for k in range(3):
             along = w[u] * w[ROT + k] + w[u + 1] * w[ROT + 3 + k] + w[u + 2] * w[ROT + 6 + k]
             w[PMAT + 3 * row + k] = along * w[SCALE + k]
     # P P^T with and without blur, and determinants as sums of squares, exact for needles.
-    blur = cam[BLUR]
+    blur = drawing.blur
     p0 = w[PMAT]
     p1 = w[PMAT + 1]
     p2 = w[PMAT + 2]
@@ -157,28 +139,27 @@ def rotation(w):
 
 
 @inlined
-def centres(means, rows, cam, out):
+def centres(means, rows, drawing, out):
     """Sixteen centres on the image, x then y in pixels, and their depths, into ``out [48]``.
 
     In float64: at the edge of a picture 960 wide a float32 centre is off by 1e-4 pixels, and alpha
     by as much.
     """
+    view = drawing.viewmat
     for lane in range(16):
         at = 3 * rows[lane]
         x = float64(means[at])
         y = float64(means[at + 1])
         z = float64(means[at + 2])
-        depth = cam[8] * x + cam[9] * y + cam[10] * z + cam[11]
+        depth = transformed(view, 8, x, y, z)
         inverse = float64(1) / depth
-        out[lane] = cam[FX] * (cam[0] * x + cam[1] * y + cam[2] * z + cam[3]) * inverse + cam[CX]
-        out[16 + lane] = (
-            cam[FY] * (cam[4] * x + cam[5] * y + cam[6] * z + cam[7]) * inverse + cam[CY]
-        )
+        out[lane] = drawing.fx * transformed(view, 0, x, y, z) * inverse + drawing.cx
+        out[16 + lane] = drawing.fy * transformed(view, 4, x, y, z) * inverse + drawing.cy
         out[32 + lane] = depth
 
 
 @inlined
-def make_records(w, centre, opacity, cam, record):
+def make_records(w, centre, opacity, drawing, record):
     """Fills the sixteen columns of the records except the colours; returns which of them reach a
     pixel centre.
     """
@@ -191,7 +172,7 @@ def make_records(w, centre, opacity, cam, record):
     record[QC] = 0.5 * LOG2E * w[COV] * idet
     record[QB] = -(LOG2E * w[COV + 1] * idet)
     record[DET] = LOG2E * LOG2E * idet
-    if cam[COMPENSATE] > 0:  # NaN for an infinite covariance, which is not drawn
+    if drawing.compensate:  # NaN for an infinite covariance, which is not drawn
         opacity = opacity * vsqrt(w[RAWDET] * idet)
     drawn = ge(opacity, ALPHA_MIN)
     record[LOG] = log2(opacity)
@@ -202,14 +183,14 @@ def make_records(w, centre, opacity, cam, record):
     record[REACH] = reach
     record[RX] = rx
     record[X0] = vmax(vceil(mx - rx - 0.5 - SLACK), 0)
-    record[X1] = vmin(vfloor(mx + rx - 0.5 + SLACK), cam[WIDTH] - 1)
+    record[X1] = vmin(vfloor(mx + rx - 0.5 + SLACK), drawing.width - 1)
     record[Y0] = vmax(vceil(my - ry - 0.5 - SLACK), 0)
-    record[Y1] = vmin(vfloor(my + ry - 0.5 + SLACK), cam[HEIGHT] - 1)
+    record[Y1] = vmin(vfloor(my + ry - 0.5 + SLACK), drawing.height - 1)
     return both(drawn, both(ge(record[X1], record[X0]), ge(record[Y1], record[Y0])))
 
 
 @inlined
-def add_records(rows, filled, at, spare, means, opacity, cam, w, packed):
+def add_records(rows, filled, at, spare, means, opacity, drawing, w, packed):
     """Packs those of the first ``filled`` of sixteen ``rows`` that reach a pixel centre, from the
     record ``at`` on.
 
@@ -218,11 +199,13 @@ def add_records(rows, filled, at, spare, means, opacity, cam, w, packed):
     record = scratch(f32x16, RECORD)
     centre = scratch(float32, 48)
     targets = scratch(int64, 16)
-    valid = covariance(cam, w)
-    centres(means, rows, cam, centre)
+    valid = covariance(drawing, w)
+    centres(means, rows, drawing, centre)
     # beyond the near plane in float32 too, not only in float64
-    valid = both(valid, ge(load(centre, 32), cam[NEAR]))
-    valid = both(valid, both(make_records(w, centre, opacity, cam, record), first_lanes(filled)))
+    valid = both(valid, ge(load(centre, 32), drawing.near))
+    valid = both(
+        valid, both(make_records(w, centre, opacity, drawing, record), first_lanes(filled))
+    )
     bits = bits_of(valid)
     if bits == uint64(0):
         return at
@@ -268,7 +251,5 @@ def project(worker, workers, stored, drawing, packed):
         queued -= filled
         load_stored(stored, rows, w)
         opacity = drawn(rows, stored, drawing, w)
-        at = add_records(
-            rows, filled, at, n + worker, stored.means, opacity, drawing.cam, w, packed
-        )
+        at = add_records(rows, filled, at, n + worker, stored.means, opacity, drawing, w, packed)
     packed.counts[worker] = color(first, at - first, stored, drawing, packed)

@@ -7,16 +7,9 @@ from numba import float32, int64
 from clod_adapter._kernels.colors import C0, load_sh, sh_basis, sh_basis_gradient, view_direction
 from clod_adapter._kernels.compiling import inlined, kernel
 from clod_adapter._kernels.conventions import (
-    BLUR,
     COV,
     COVDET,
-    FX,
-    FY,
     GRADIENTS,
-    HIGH_X,
-    HIGH_Y,
-    LOW_X,
-    LOW_Y,
     PAIR,
     PMAT,
     POINT,
@@ -53,7 +46,7 @@ from clod_adapter._kernels.simd import eq, f32x16, gt, select, splat, vmax, vmin
 
 
 @inlined
-def covariance_gradient(w, g, cam, compensated):
+def covariance_gradient(w, g, drawing, compensated):
     """Gradients of scales, rotation matrix and mean from the sums over pixels."""
     idet = 1 / w[COVDET]
     a = w[COV + 2] * idet
@@ -71,8 +64,8 @@ def covariance_gradient(w, g, cam, compensated):
                 cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
                 adjugate0 += w[PMAT + 3 + j] * cross
                 adjugate1 -= w[PMAT + j] * cross
-        t0 = (adjugate0 + cam[BLUR] * p0) * idet
-        t1 = (adjugate1 + cam[BLUR] * p1) * idet
+        t0 = (adjugate0 + drawing.blur * p0) * idet
+        t1 = (adjugate1 + drawing.blur * p1) * idet
         m0 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1
         m1 = g[SUMS + 7] * t0 + g[SUMS + 8] * t1
         g[V_P + k] = a * m0 + b * m1
@@ -89,21 +82,22 @@ def covariance_gradient(w, g, cam, compensated):
             g[V_ROT + 3 * d + k] = v * w[SCALE + k]
     v_x = a * g[SUMS + 4] + b * g[SUMS + 5]
     v_y = b * g[SUMS + 4] + e * g[SUMS + 5]
-    point_gradient(w, g, v_x, v_y, cam)
+    point_gradient(w, g, v_x, v_y, drawing)
 
 
 @inlined
-def point_gradient(w, g, v_x, v_y, cam):
+def point_gradient(w, g, v_x, v_y, drawing):
     """Adds the gradients through the projected centre and through the Jacobian to that of the
     mean.
     """
+    view = drawing.viewmat
     x = w[POINT]
     y = w[POINT + 1]
     iz = 1 / w[POINT + 2]
     rx = x * iz
     ry = y * iz
-    clamped_x = vmin(vmax(rx, cam[LOW_X]), cam[HIGH_X])
-    clamped_y = vmin(vmax(ry, cam[LOW_Y]), cam[HIGH_Y])
+    clamped_x = vmin(vmax(rx, drawing.low_x), drawing.high_x)
+    clamped_y = vmin(vmax(ry, drawing.low_y), drawing.high_y)
     j00 = j02 = j11 = j12 = splat(0)
     for d in range(3):
         u0 = u1 = splat(0)
@@ -111,12 +105,12 @@ def point_gradient(w, g, v_x, v_y, cam):
             q = w[ROT + 3 * d + k] * w[SCALE + k]
             u0 += g[V_P + k] * q
             u1 += g[V_P + 3 + k] * q
-        j00 += u0 * cam[d]
-        j02 += u0 * cam[8 + d]
-        j11 += u1 * cam[4 + d]
-        j12 += u1 * cam[8 + d]
-    fx = cam[FX] * iz
-    fy = cam[FY] * iz
+        j00 += u0 * view[d]
+        j02 += u0 * view[8 + d]
+        j11 += u1 * view[4 + d]
+        j12 += u1 * view[8 + d]
+    fx = drawing.fx * iz
+    fy = drawing.fy * iz
     # The projected centre, then the factor 1/z of all four entries of the Jacobian.
     v_z = -(fx * rx * v_x + fy * ry * v_y) - iz * (
         fx * (j00 - clamped_x * j02) + fy * (j11 - clamped_y * j12)
@@ -127,7 +121,7 @@ def point_gradient(w, g, v_x, v_y, cam):
     v_y = fy * v_y + v_ry
     v_z = v_z - v_rx * rx - v_ry * ry
     for d in range(3):
-        g[V_MEAN + d] += cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z
+        g[V_MEAN + d] += view[d] * v_x + view[4 + d] * v_y + view[8 + d] * v_z
 
 
 @inlined
@@ -161,7 +155,7 @@ def color_gradient(w, g, shN, rows, drawing, sh, basis, tuned, v_shN):
     direction.
     """
     degree = drawing.degree
-    inverse = view_direction(w, drawing.cam, sh)
+    inverse = view_direction(w, drawing, sh)
     x = sh[0]
     y = sh[1]
     z = sh[2]
@@ -269,8 +263,8 @@ def project_gradient(
         if shaped or tuned:
             color_gradient(w, g, stored.shN, rows, drawing, sh, basis, tuned, gradients.shN)
         if shaped:
-            covariance(drawing.cam, w)
-            covariance_gradient(w, g, drawing.cam, compensated)
+            covariance(drawing, w)
+            covariance_gradient(w, g, drawing, compensated)
             quat_gradient(w, g)
             store_rows(gradients.means, rows, 3, 0, 3, g, V_MEAN)
             store_rows(gradients.quats, rows, 4, 0, 4, g, V_QUAT)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from clod_adapter._kernels import blend, conventions, dial, threads, tiles
-from clod_adapter._kernels.conventions import Drawing, Packed, Picture, Stored, Tiles
+from clod_adapter._kernels.conventions import Dial, Drawing, Packed, Picture, Stored, Tiles
 from clod_adapter._kernels.memory import recycled, recycled_array
 from clod_adapter._kernels.project import project
 from clod_adapter._kernels.project_gradient import project_gradient
@@ -23,44 +23,53 @@ from clod_adapter.equation.attenuation import check_dial, growth_distance
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float32
 
-ACTIVATED = np.zeros(dial.DIAL, np.float32)
-ACTIVATED[dial.ACTIVATED] = 1
 NOTHING = torch.empty(0, dtype=torch.float32, device="cpu")  # no dial, or no growth
 FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
 FASTEST = 1e18  # rate of a dial, whose square float32 holds
 
 
-def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
-    """Camera and screen-space filter in the layout of the kernels (``_kernels/conventions.py``)."""
-    out = np.empty(conventions.CAMERA, np.float32)
+def drawing_of(camera: Camera, screen_filter: ScreenFilter, dial: Dial, **more: Any) -> Drawing:
+    """Settings for the kernels."""
     viewmat = float64_array(camera.viewmat)
     K = float64_array(camera.K)
-    fx = float(K[0, 0])
-    fy = float(K[1, 1])
-    cx = float(K[0, 2])
-    cy = float(K[1, 2])
-    out[:16] = viewmat.reshape(-1)
-    out[16:22] = fx, fy, cx, cy, camera.width, camera.height
+    fx = K[0, 0]
+    fy = K[1, 1]
+    cx = K[0, 2]
+    cy = K[1, 2]
     margin_x = 0.15 * camera.width / fx
     margin_y = 0.15 * camera.height / fy
-    out[22:24] = -(cx / fx + margin_x), (camera.width - cx) / fx + margin_x
-    out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
-    out[26:29] = -viewmat[:3, 3] @ viewmat[:3, :3]
-    out[conventions.NEAR] = camera.near
-    out[conventions.BLUR] = screen_filter.variance
-    out[conventions.COMPENSATE] = screen_filter.compensate
-    return out
+    numbers = {
+        "fx": fx,
+        "fy": fy,
+        "cx": cx,
+        "cy": cy,
+        "width": camera.width,
+        "height": camera.height,
+        "low_x": -(cx / fx + margin_x),
+        "high_x": (camera.width - cx) / fx + margin_x,
+        "low_y": -(cy / fy + margin_y),
+        "high_y": (camera.height - cy) / fy + margin_y,
+        "near": camera.near,
+        "blur": screen_filter.variance,
+    }
+    return Drawing(
+        viewmat=viewmat.astype(np.float32).reshape(-1),
+        eye=(-viewmat[:3, 3] @ viewmat[:3, :3]).astype(np.float32),
+        compensate=screen_filter.compensate,
+        dial=dial,
+        **{name: np.float32(number) for name, number in numbers.items()},
+        **more,
+    )
 
 
-def dial_vector(config: AttenuationConfig, virtual_scale: float) -> np.ndarray:
-    """A dial value in the layout of the kernels."""
-    out = np.zeros(dial.DIAL, np.float32)
+def dial_of(config: AttenuationConfig | None, virtual_scale: float) -> Dial:
+    """A dial value for the kernels."""
+    if config is None:
+        return Dial()
     rate = virtual_scale / config.scene_distance
-    out[dial.RATE2] = min(rate, FASTEST) ** 2
-    if config.near_distance > 0:
-        out[dial.NEAR2] = min(config.scene_distance / config.near_distance, FASTEST) ** 2
-    out[dial.GROWTH_RATE2] = min(rate / growth_distance(config), FASTEST) ** 2
-    return out
+    near = config.scene_distance / config.near_distance if config.near_distance > 0 else 0.0
+    rates = rate, rate / growth_distance(config), near
+    return Dial(*(np.float32(min(each, FASTEST) ** 2) for each in rates))
 
 
 def workers_for(rows: int) -> int:
@@ -72,13 +81,14 @@ class ForwardState:
     """State of the forward pass for the backward pass: projection, depth order and tile lists."""
 
     def __init__(
-        self, stored: Stored, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray
+        self, stored: Stored, camera: Camera, screen_filter: ScreenFilter, dial: Dial
     ) -> None:
         n = len(stored.means)
         workers = workers_for(n)
         self.compensated = screen_filter.compensate or None
-        self.drawing = Drawing(
-            camera_vector(camera, screen_filter),
+        self.drawing = drawing_of(
+            camera,
+            screen_filter,
             dial,
             degree=math.isqrt(stored.shN.shape[1] + 1) - 1,
             fades=len(stored.sigma) > 0,
@@ -240,7 +250,7 @@ class _Compiled(Rasterizer):
         return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
             camera,
             g.screen_filter,
-            _dial_vector(g, virtual_scale),
+            dial_of(g.attenuation, virtual_scale),
             len(g) if trained is None else trained,
             background,
             *Stored(
@@ -261,8 +271,7 @@ class _Compiled(Rasterizer):
             dial.mark_kept,
             workers_for(len(marks)),
             *_arrays((gaussians.means, gaussians.sigma_d.float())),
-            camera_vector(camera),
-            _dial_vector(gaussians, virtual_scale),
+            drawing_of(camera, CLASSIC, dial_of(gaussians.attenuation, virtual_scale)),
             marks,
         )
         return torch.from_numpy(marks).view(torch.bool)
@@ -273,11 +282,6 @@ def _composed(gaussians: Gaussians) -> bool:
     kernels.
     """
     return gaussians.attenuation is not None and gaussians.attenuation.form == "paper"
-
-
-def _dial_vector(gaussians: Gaussians, virtual_scale: float) -> np.ndarray:
-    config = gaussians.attenuation
-    return np.zeros(dial.DIAL, np.float32) if config is None else dial_vector(config, virtual_scale)
 
 
 def rasterize(
@@ -305,7 +309,7 @@ def rasterize(
     return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
         camera,
         screen_filter,
-        ACTIVATED,
+        Dial(activated=True),
         len(means),
         background,
         *Stored(means, quats, scales, opacities, NOTHING, NOTHING, sh0, shN),

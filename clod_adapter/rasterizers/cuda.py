@@ -127,7 +127,10 @@ def _project(
         packed=True,
         near_plane=camera.near,
         far_plane=math.inf,
+        radius_clip=0.0,
+        sparse_grad=False,
         calc_compensations=screen_filter.compensate,
+        camera_model="pinhole",
         opacities=opacities.detach(),
     )
     # of cameras, Gaussians; 1.5.3 has batches before them, 1.6.0 also the bounds of each image
@@ -178,6 +181,7 @@ def _blend(projected: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor
         TILE,
         across,
         down,
+        segmented=False,
         packed=True,
         n_images=1,
         image_ids=ids,
@@ -196,7 +200,9 @@ def _blend(projected: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor
         TILE,
         offsets,
         order,
+        backgrounds=None,
         packed=True,
+        absgrad=False,
     )
     return image[0], alpha[0, ..., 0]
 
