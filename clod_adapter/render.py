@@ -13,7 +13,6 @@ from clod_adapter.equation.attenuation import dial, warn_of_no_dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, for_device
-from clod_adapter.rasterizers.protocol import behind
 
 
 @dataclass(frozen=True)
@@ -53,18 +52,9 @@ def splat(
     """
     if opacities.shape != (len(gaussians),):
         raise ClodError(f"opacities are {tuple(opacities.shape)} and must be ({len(gaussians)},)")
-    scales = gaussians.scales if growth is None else gaussians.scales * growth[:, None]
-    return for_device(gaussians.means.device).splat(
-        gaussians.means,
-        gaussians.quats,
-        scales,
-        opacities,
-        gaussians.sh0,
-        gaussians.shN,
-        camera,
-        behind(gaussians),
-        gaussians.screen_filter,
-    )
+    growth = torch.ones_like(opacities) if growth is None else growth
+    rasterizer = for_device(gaussians.means.device)
+    return rasterizer.draw_opacities(gaussians, opacities, growth, camera)
 
 
 def render(

@@ -3,9 +3,9 @@
 from numba import float32, int64
 
 from clod_adapter._kernels.compiling import kernel
-from clod_adapter._kernels.elementary import vsqrt
+from clod_adapter._kernels.elementary import bits_of, vsqrt
 from clod_adapter._kernels.pointers import load, load_where, pointer, scratch, share, store_where
-from clod_adapter._kernels.simd import anywhere, fma, gt, splat
+from clod_adapter._kernels.simd import fma, gt, splat
 
 # numbers of sixteen rows: at most the harmonics of degree 3, the highest that Gaussians have
 ROOM = 16 * 45
@@ -75,7 +75,7 @@ def adam_rows(
             factor = load(factors, k)
             at = width * start + k
             chosen = gt(factor, 0)
-            if anywhere(chosen):
+            if bits_of(chosen):
                 g = load_where(chosen, gradient, at)
                 m = fma(beta1, load_where(chosen, first, at), rest1 * g)
                 v = fma(beta2, load_where(chosen, second, at), rest2 * g * g)

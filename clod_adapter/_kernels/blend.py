@@ -31,7 +31,7 @@ from clod_adapter._kernels.conventions import (
     T_MIN,
     TILE,
 )
-from clod_adapter._kernels.elementary import exp2, lowest, set_spans, vabs
+from clod_adapter._kernels.elementary import bits_of, exp2, lowest, set_spans, vabs
 from clod_adapter._kernels.pointers import (
     count_up,
     load,
@@ -43,7 +43,6 @@ from clod_adapter._kernels.pointers import (
     store_sums,
 )
 from clod_adapter._kernels.simd import (
-    anywhere,
     both,
     fma,
     ge,
@@ -210,9 +209,9 @@ def blend(worker, workers, tiles, cursor, room, background, picture):
                     store(state, at + 32, fma(weight, g.green, load(state, at + 32)))
                     store(state, at + 48, fma(weight, g.blue, load(state, at + 48)))
                     t = select(met.blends, met.after, t)
-                    if anywhere(met.ends):
+                    if bits_of(met.ends):
                         t = select(met.ends, 0 - t, t)
-                        if not anywhere(gt(t, 0)):
+                        if not bits_of(gt(t, 0)):
                             live[word] &= ~(uint64(1) << uint64(block % 64))
                     store(state, at, t)
         write_tile(ox, oy, tiles, state, background, picture)

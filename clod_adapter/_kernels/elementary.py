@@ -23,6 +23,10 @@ def _constant(value: float) -> ir.Constant:
     return ir.Constant(VECTOR if isinstance(value, float) else INTEGERS, [value] * LANES)
 
 
+def _fma(builder, *factors_and_summand):
+    return call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, factors_and_summand)
+
+
 vsqrt = llvm_function("sqrt", 1)
 vabs = llvm_function("fabs", 1)
 vfloor = llvm_function("floor", 1)
@@ -46,7 +50,7 @@ def exp2(builder, x):
     f = builder.fsub(x, builder.fsub(shifted, _constant(_ROUNDING)))
     p = _constant(_EXP2[0])
     for c in _EXP2[1:]:
-        p = call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, f, _constant(c)])
+        p = _fma(builder, p, f, _constant(c))
     exponent = builder.shl(builder.bitcast(shifted, INTEGERS), _constant(23))
     return builder.bitcast(builder.add(builder.bitcast(p, INTEGERS), exponent), VECTOR)
 
@@ -65,12 +69,8 @@ def log2(builder, x):
     square = builder.fmul(s, s)
     p = _constant(2 / math.log(2) / 9)
     for k in (7, 5, 3, 1):
-        p = call_llvm(
-            builder, "llvm.fmuladd.v16f32", VECTOR, [p, square, _constant(2 / math.log(2) / k)]
-        )
-    return call_llvm(
-        builder, "llvm.fmuladd.v16f32", VECTOR, [p, s, builder.sitofp(exponent, VECTOR)]
-    )
+        p = _fma(builder, p, square, _constant(2 / math.log(2) / k))
+    return _fma(builder, p, s, builder.sitofp(exponent, VECTOR))
 
 
 @operation(types.none, types.CPointer(types.uint64), types.int64, f32x16, f32x16)

@@ -154,15 +154,6 @@ def load_some(values, index, count):
 
 
 @inlined
-def store_some(values, index, count, vector):
-    """Stores the first ``count`` lanes."""
-    if count >= 16:
-        store(values, index, vector)
-    else:
-        store_where(first_lanes(count), values, index, vector)
-
-
-@inlined
 def gather(values, rows):
     """``values[rows[lane]]`` in each lane."""
     lanes = scratch(float32, 16)

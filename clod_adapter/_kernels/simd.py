@@ -148,10 +148,3 @@ _logic = operation(mask16, mask16, mask16)
 both = _logic(lambda builder, a, b: builder.and_(a, b))
 # a where the mask is set, b elsewhere.
 select = operation(f32x16, mask16, *_pair)(lambda builder, mask, a, b: builder.select(mask, a, b))
-
-
-@operation(types.boolean, mask16)
-def anywhere(builder, mask):
-    """Whether any lane is set."""
-    bits = builder.bitcast(mask, ir.IntType(LANES))
-    return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))

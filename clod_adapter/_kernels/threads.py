@@ -47,9 +47,6 @@ def torch_on_one_thread() -> Iterator[None]:
 
 def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
     """Calls ``kernel(worker, workers, *arguments)`` for each worker and waits for all of them."""
-    if workers == 1:
-        kernel(0, 1, *arguments)
-        return
     futures = list[Future[None]]()
     try:
         for worker in range(1, workers):

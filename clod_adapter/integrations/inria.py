@@ -90,7 +90,7 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
         signature = inspect.signature(super().forward)
         bound = signature.bind(means3D, means2D, opacities_drawn, *args, **kwargs)
-        for name, power in () if growth_d is None else (("scales", 1), ("cov3D_precomp", 2)):
+        for name, power in (("scales", 1), ("cov3D_precomp", 2)):
             if (value := bound.arguments.get(name)) is not None:
                 bound.arguments[name] = value * growth.to(value)[:, None] ** power
         return super().forward(*bound.args, **bound.kwargs)

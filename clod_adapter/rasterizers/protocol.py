@@ -80,18 +80,28 @@ class Rasterizer:
         ``seen_from`` is the camera of the dial's distances, where it is another. The first
         ``trained`` rows alone need gradients.
         """
-        attenuated = dial(gaussians, seen_from or camera, virtual_scale)
-        g = gaussians
+        drawn, _, growth = dial(gaussians, seen_from or camera, virtual_scale)
+        return self.draw_opacities(gaussians, drawn, growth, camera, background)
+
+    def draw_opacities(
+        self,
+        gaussians: Gaussians,
+        opacities: Tensor,
+        growth: Tensor,
+        camera: Camera,
+        background: Tensor | np.ndarray | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """The picture of activated ``opacities [N]`` and scales times ``growth [N]``."""
         return self.splat(
-            g.means,
-            g.quats,
-            g.scales * attenuated.growth[:, None],
-            attenuated.drawn,
-            g.sh0,
-            g.shN,
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales * growth[:, None],
+            opacities,
+            gaussians.sh0,
+            gaussians.shN,
             camera,
             behind(gaussians, background),
-            g.screen_filter,
+            gaussians.screen_filter,
         )
 
     def kept(self, gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:

@@ -162,19 +162,14 @@ def _along_curve(means: Tensor) -> Tensor:
     return torch.from_numpy(np.argsort(code, kind="stable")).to(means.device)
 
 
-def _digits(row: list[float]) -> list[float]:
-    """The numbers with the digits that float32 has."""
-    return [float(f"{value:.9g}") for value in row]
-
-
 def camera_entry(camera: Camera, placed: bool = False) -> Entry:
     """A camera of the page's configuration. ``placed``: it is not a photograph's; the page levels
     it.
     """
     return {
         "name": camera.name,
-        "viewmat": list(map(_digits, camera.viewmat.tolist())),
-        "K": list(map(_digits, camera.K.tolist())),
+        "viewmat": camera.viewmat.tolist(),
+        "K": camera.K.tolist(),
         "width": camera.width,
         "height": camera.height,
         "near": camera.near,
