@@ -61,11 +61,15 @@ BLOCKS = ACROSS * ACROSS
 WORDS = BLOCKS // 64
 FORWARD_STATE = BLOCKS * 64
 BACKWARD_STATE = BLOCKS * 80
-BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
-BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 lane_x = lanes(np.tile(np.arange(4) + 0.5, 4))
 lane_y = lanes(np.repeat(np.arange(4) + 0.5, 4))
 LAST = float32(ACROSS - 1)
+
+
+@inlined
+def corner(block):
+    """A block's first column and row of pixels in its tile."""
+    return BLOCK * (block % ACROSS), BLOCK * (block // ACROSS)
 
 
 @inlined
@@ -74,8 +78,9 @@ def start_tile(ox, oy, tiles, state, stride, live):
     for word in range(WORDS):
         live[word] = uint64(0)
     for block in range(BLOCKS):
-        x = ox + (block % ACROSS) * BLOCK
-        y = oy + (block // ACROSS) * BLOCK
+        column, row = corner(block)
+        x = ox + column
+        y = oy + row
         if x < tiles.width and y < tiles.height:
             live[block // 64] |= uint64(1) << uint64(block % 64)
         inside = both(gt(tiles.width - x, lane_x()), gt(tiles.height - y, lane_y()))
@@ -146,8 +151,9 @@ class Meeting(NamedTuple):
 @inlined
 def meet(g, t, block):
     """The ``Meeting`` of a Gaussian with the pixels of a block, whose transmittances are ``t``."""
-    dx = g.base_x + BLOCK_X[block]
-    dy = g.base_y + BLOCK_Y[block]
+    column, row = corner(block)
+    dx = g.base_x + column
+    dy = g.base_y + row
     along_x = fma(g.minus_qa, dx, g.minus_qb * dy)
     unlimited = exp2(fma(dx, along_x, fma(g.minus_qc * dy, dy, g.log)))
     alpha = vmin(unlimited, ALPHA_MAX)
@@ -224,8 +230,9 @@ def write_tile(ox, oy, tiles, state, background, picture):
     height = tiles.height
     block_values = scratch(float32, 64)
     for block in range(BLOCKS):
-        x = ox + BLOCK * (block % ACROSS)
-        y = oy + BLOCK * (block // ACROSS)
+        column, row = corner(block)
+        x = ox + column
+        y = oy + row
         at = block * 64
         if x >= width or y >= height:
             continue
@@ -250,8 +257,9 @@ def read_tile(ox, oy, tiles, picture, gradients, state):
     width = tiles.width
     height = tiles.height
     for block in range(BLOCKS):
-        x = ox + BLOCK * (block % ACROSS)
-        y = oy + BLOCK * (block // ACROSS)
+        column, row = corner(block)
+        x = ox + column
+        y = oy + row
         at = block * 80
         if x >= width or y >= height:
             continue

@@ -6,6 +6,7 @@ from numba import float32, int64, uint64
 
 from clod_adapter._kernels.compiling import inlined
 from clod_adapter._kernels.conventions import HUGE, MEAN, RECORD, RED
+from clod_adapter._kernels.dial import squared_distance
 from clod_adapter._kernels.elementary import bits_of, vabs, vsqrt
 from clod_adapter._kernels.pointers import load_rows, scratch, store_rows
 from clod_adapter._kernels.simd import f32x16, fma, gt, splat, vmax
@@ -96,13 +97,9 @@ def sh_basis_gradient(degree, x, y, z, v):
 @inlined
 def view_direction(w, drawing, out):
     """Unit directions from the camera to the Gaussians into ``out[:3]``; returns 1 / distance."""
-    x = w[MEAN] - drawing.eye[0]
-    y = w[MEAN + 1] - drawing.eye[1]
-    z = w[MEAN + 2] - drawing.eye[2]
-    inverse = 1 / vsqrt(x * x + y * y + z * z)
-    out[0] = x * inverse
-    out[1] = y * inverse
-    out[2] = z * inverse
+    inverse = 1 / vsqrt(squared_distance(w, drawing))
+    for k in range(3):
+        out[k] = (w[MEAN + k] - drawing.eye[k]) * inverse
     return inverse
 
 

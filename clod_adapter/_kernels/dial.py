@@ -46,10 +46,11 @@ def transformed(view, row, x, y, z):
 @inlined
 def squared_distance(w, drawing):
     """Squared distances from the camera to the centres ``w[:3]``, world units^2."""
-    dx = w[0] - drawing.eye[0]
-    dy = w[1] - drawing.eye[1]
-    dz = w[2] - drawing.eye[2]
-    return dx * dx + dy * dy + dz * dz
+    total = splat(0)
+    for k in range(3):
+        offset = w[k] - drawing.eye[k]
+        total += offset * offset
+    return total
 
 
 @inlined

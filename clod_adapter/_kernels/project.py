@@ -80,8 +80,9 @@ def covariance(drawing, w):
     view = drawing.viewmat
     for d in range(3):
         w[POINT + d] = transformed(view, 4 * d, w[MEAN], w[MEAN + 1], w[MEAN + 2])
-    norm2 = w[STORED] * w[STORED] + w[STORED + 1] * w[STORED + 1]
-    norm2 = norm2 + w[STORED + 2] * w[STORED + 2] + w[STORED + 3] * w[STORED + 3]
+    norm2 = splat(0)
+    for d in range(4):
+        norm2 += w[STORED + d] * w[STORED + d]
     valid = both(ge(norm2, QUAT_MIN2), ge(QUAT_MAX2, norm2))
     valid = both(ge(w[POINT + 2], drawing.near), valid)
     w[QINV] = 1 / vsqrt(norm2)
