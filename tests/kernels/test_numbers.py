@@ -1,4 +1,4 @@
-"""Compiled functions against plain ones in float64: the count term, the losses."""
+"""The count term and the losses in float32 against float64."""
 
 import math
 from itertools import product
@@ -24,14 +24,12 @@ CONFIG = AdaptConfig(max_sv=7.0)
     s=st.sampled_from([1.0, 2.5, 10.0]),
     seed=st.integers(0, 99),
     share=st.sampled_from([0.02, 0.4, 1.0]),
-    workers=st.sampled_from([1, 3]),
 )
-def test_both_forms_of_the_count_term_agree(n, s, seed, share, workers):
+def test_the_count_term_in_float32(n, s, seed, share):
     random = seeded(seed)
     d = 2 * torch.rand(n, generator=random)
     sigma = s * d * (torch.randn(n, generator=random) / 4).exp()
-    with torch_threads(workers):
-        got = count_gradient(d, sigma, s, 0.1, CONFIG, share)
+    got = count_gradient(d, sigma, s, 0.1, CONFIG, share)
     want = count_gradient(d.double(), sigma.double(), s, 0.1, CONFIG, share)
     torch.testing.assert_close(
         got.double(), want, rtol=1e-4, atol=1e-6 * max(float(want.abs().max()), 1e-9)
