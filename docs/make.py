@@ -102,7 +102,7 @@ def shown(value: object) -> str:
 def names_page() -> str:
     """Every public name, by the module that defines it."""
     parts = ["# Names\n\nAll are in `clod_adapter`, except those of `clod_adapter.integrations`.\n"]
-    homes = sorted((clod_adapter._homes[name], name) for name in clod_adapter.__all__)
+    homes = sorted((getattr(clod_adapter, name).__module__, name) for name in clod_adapter.__all__)
     for module, names in groupby(homes, key=lambda pair: pair[0]):
         parts += [f"## {module}\n", *(f"::: {module}.{name}\n" for _, name in names)]
     parts += ["## integrations\n", *(f"::: clod_adapter.{name}\n" for name in INTEGRATIONS)]

@@ -324,7 +324,8 @@ def test_the_built_site(tmp_path, monkeypatch):
     generated = {"commands.html", "settings.html", "names.html"}
     pages = {f"{page.stem}.html" for page in DOCS.glob("*.md")} | generated
     assert pages == {entry.partition("#")[0] for entry in entries}
-    named = {f"names.html#{clod_adapter._homes[name]}.{name}" for name in clod_adapter.__all__}
+    public = [getattr(clod_adapter, name) for name in clod_adapter.__all__]
+    named = {f"names.html#{each.__module__}.{each.__name__}" for each in public}
     assert named | {f"commands.html#clod-adapt-{name}" for name in COMMANDS} <= entries
     assert (site / "search" / "search_index.js").is_file()  # for pages opened from a folder
     assert not list(site.rglob("*.py")) and not list(site.rglob("*.md"))
