@@ -7,14 +7,15 @@ an optional dependency, imported when a figure is drawn.
 
 import importlib.util
 import io
-import math
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from clod_adapter._support.text import package_version
 from clod_adapter.errors import ClodError
@@ -50,22 +51,9 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # keeps text as text in a page
 }
 Draw = Callable[[Any], None]  # of the axes of an empty figure
-SIZE = (7.2, 4.1)  # inches, without the legend
-NARROW = (4.0, 4.0)  # likewise, for phones
-MARGINS = (0.75, 0.5, 0.65, 0.1)  # left, bottom, right and top of the axes, inches
-COLUMN = 2.4  # width of a column of the legend, inches
-LINE = 0.19  # height of a line of the legend, inches
+SIZE = (7.2, 4.8)  # inches
 MARKERS = "oDs^vPX"
 ROOM = (38, 11)  # points that a label takes
-# steps of a decade, the coarsest series first
-TICK_SERIES: tuple[Sequence[float], ...] = (
-    (1,),
-    (1, 2, 5),
-    (1, 1.5, 2, 3, 4, 5, 7),
-    tuple(k / 10 for k in range(10, 100)),
-)
-FEWEST_TICKS = 3
-MOST_TICKS = 9
 BASE = "base, unadapted"
 
 
@@ -92,16 +80,15 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
         report.get("rows", []),
         not plain_model,
     )
-    others = dict[tuple[str, bool], Any]()  # by label, and whether several rows are of one file
+    pruned = defaultdict[str, list[Any]](list)
     for entry in report.get("ranked") or []:
-        others.setdefault((f"base pruned by {entry['by']}", False), []).append(entry["row"])
+        pruned[f"base pruned by {entry['by']}"].append(entry["row"])
+    files = defaultdict[str, list[Any]](list)
     for entry in report.get("against") or []:
-        others.setdefault((entry["label"], True), []).append(entry["theirs"])
+        files[entry["label"]].append(entry["theirs"])
     all_series = [model, Series(BASE, base)]
-    all_series += [
-        Series(label, rows, one_file and len(rows) > 1)
-        for (label, one_file), rows in others.items()
-    ]
+    all_series += [Series(label, rows) for label, rows in pruned.items()]
+    all_series += [Series(label, rows, len(rows) > 1) for label, rows in files.items()]
     all_series.append(Series("plain viewer, no dial", [report.get("detached_row") or {}]))
     complete = []
     for series in all_series:
@@ -117,55 +104,30 @@ def chart_file(page: Path, name: str) -> Path:
 
 
 @contextmanager
-def chart(draw: Draw, size: tuple[float, float]) -> Iterator[Any]:
-    """A figure with the chart in fixed margins, whose layout takes no time; higher than ``size`` by
-    the legend.
-    """
-    (left, bottom, right, top), (width, height) = MARGINS, size
-    with new_figure(size) as figure:
-        axes = figure.add_subplot()
-        draw(axes)
-        lines = math.ceil(len(axes.get_legend().get_texts()) / _columns(axes))
-        above = top + LINE * lines
-        figure.set_size_inches(width, height + above)
-        axes.set_position(
-            (
-                left / width,
-                bottom / (height + above),
-                1 - (left + right) / width,
-                (height - bottom) / (height + above),
-            )
-        )
+def chart(draw: Draw) -> Iterator[Any]:
+    """A figure with the chart."""
+    with new_figure(SIZE, layout="constrained") as figure:
+        draw(figure.subplots())
         yield figure
 
 
-def _columns(axes: Any) -> int:
-    """The number of columns of a legend that have room."""
-    return max(int(axes.figure.get_size_inches()[0] / COLUMN), 1)
-
-
-def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
-    """The chart as SVG elements for desktops and phones, in the colours of ``style.css``, with ids
-    by its name.
-    """
+def inline_svg(draw: Draw, name: str, label: str) -> str:
+    """The chart as an SVG element, in the colours of ``style.css``, with ids by its name."""
     names = {INK: "ink", QUIET: "quiet", GRID: "line", PAPER: "paper"}
     names |= {colour: f"series-{k + 1}" for k, colour in enumerate(SERIES[:-1])}
-    charts = []
-    for kind, size in (("wide", SIZE), ("narrow", NARROW)):
-        with chart(draw, size) as figure:
-            text = io.StringIO()
-            figure.savefig(
-                text, format="svg", transparent=True, metadata={"Date": None, "Creator": None}
-            )
-        svg = text.getvalue()[text.getvalue().index("<svg") :]
-        for colour, variable in names.items():
-            svg = svg.replace(colour, f"var(--{variable})")
-        head = rf'<svg class="{kind}" viewBox="\1" role="img" aria-label="{label}">'
-        svg = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', head, svg)
-        svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S).replace("xlink:href", "href")
-        svg = re.sub(r'( id="|"#|url\(#)', rf"\g<1>{name}-{kind}-", svg)
-        charts.append(svg.replace("'DejaVu Sans'", "ui-sans-serif, system-ui, sans-serif"))
-    return charts
+    with chart(draw) as figure:
+        file = io.StringIO()
+        undated = {"Date": None, "Creator": None}
+        figure.savefig(file, format="svg", transparent=True, metadata=undated)
+    text = file.getvalue()
+    svg = text[text.index("<svg") :]
+    for colour, variable in names.items():
+        svg = svg.replace(colour, f"var(--{variable})")
+    head = rf'<svg viewBox="\1" role="img" aria-label="{label}">'
+    svg = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', head, svg)
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S).replace("xlink:href", "href")
+    svg = re.sub(r'( id="|"#|url\(#)', rf"\g<1>{name}-", svg)
+    return svg.replace("'DejaVu Sans'", "ui-sans-serif, system-ui, sans-serif")
 
 
 # by the name of the chart: the value of a row, the unit of the axis, its label
@@ -183,7 +145,7 @@ def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
         rows = [row for row in line.rows if row[key] > 0]  # a log axis has no 0
         if not rows:
             continue
-        points = [(row[key] / unit, row["psnr"]) for row in rows]
+        points = [(row[key] / unit, error(row["psnr"])) for row in rows]
         _line(axes, k, line.label, points, linestyle="-" if line.dial else "none")
         if line.dial:
             texts = [f"s = {row['virtual_scale']:g}" for row in rows]
@@ -206,10 +168,10 @@ def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: flo
     horizontal line.
     """
     for k, curve in enumerate(curves):
-        points = [(point["seconds"], point["psnr"]) for point in curve["points"]]
+        points = [(point["seconds"], error(point["psnr"])) for point in curve["points"]]
         _line(axes, k, curve["label"], points)
     if base_psnr is not None:
-        axes.axhline(base_psnr, color=INK, linestyle="--", linewidth=1.1, label=BASE)
+        axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label=BASE)
     _finish(axes, "seconds of adapting (log scale)")
 
 
@@ -224,44 +186,35 @@ def _line(
     axes.plot(*zip(*points, strict=True), linewidth=1.8, markersize=5.5, label=label, **style)
 
 
-def error(psnr: float) -> float:
-    """Mean squared error of colours in [0, 1] for a PSNR in dB."""
-    return 10.0 ** (-psnr / 10)
+def error(psnr: Any) -> Any:
+    """Mean squared error of colours in [0, 1], in thousandths, for a PSNR in dB."""
+    return 1e3 * 10.0 ** (-psnr / 10)
+
+
+def psnr_of(thousandths: Any) -> Any:
+    """The inverse of ``error``."""
+    return 30 - 10 * np.log10(thousandths)
 
 
 def _finish(axes: Any, label: str) -> None:
-    """Axes of an error chart: PSNR downwards, which is the logarithm of the error; labels of both
-    at the same ticks.
-    """
+    """Log axes, PSNR on the right, and the legend above them, where it covers nothing."""
+    from matplotlib.ticker import AutoLocator, ScalarFormatter
+
     axes.set_xscale("log")
+    axes.set_yscale("log")
     axes.set_xlabel(label)
-    axes.margins(x=0.2, y=0.12)
-    axes.invert_yaxis()
-    axes.secondary_yaxis("right").set_ylabel("PSNR (dB)")
     axes.set_ylabel("mean squared error, thousandths (log scale)")
-    axes.set_yticks(_round_errors(*axes.get_ylim()))
-    axes.yaxis.set_major_formatter(lambda psnr, _: f"{1e3 * error(psnr):.3g}")
-    near, far = axes.get_xlim()
-    subs = TICK_SERIES[1] if far / near > 20 else TICK_SERIES[2]
-    label_log(axes.xaxis, "{:,g}", subs)
-    # above the axes it covers nothing
-    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_columns(axes), borderaxespad=0)
+    axes.margins(x=0.2, y=0.12)
+    label_log(axes.xaxis, "{:,g}")
+    label_log(axes.yaxis, "{:,g}")
+    right = axes.secondary_yaxis("right", functions=(psnr_of, error))
+    right.set_ylabel("PSNR (dB)")
+    right.yaxis.set_major_locator(AutoLocator())
+    right.yaxis.set_major_formatter(ScalarFormatter())
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0)
     axes.annotate(
         "better", (0.012, 0.018), xycoords="axes fraction", fontsize=8, color=QUIET, style="italic"
     )
-
-
-def _round_errors(low: float, high: float) -> list[float]:
-    """The PSNR of round errors: of the coarsest series of steps with FEWEST_TICKS in the range."""
-    low, high = sorted((low, high))
-    decades = range(math.floor(-high / 10), math.ceil(-low / 10) + 1)
-    ticks = list[float]()
-    for steps in TICK_SERIES:
-        every = (-10 * math.log10(step) - 10 * decade for decade, step in product(decades, steps))
-        ticks = [psnr for psnr in every if low <= psnr <= high]
-        if len(ticks) >= FEWEST_TICKS:
-            break
-    return ticks[:: max(math.ceil(len(ticks) / MOST_TICKS), 1)]
 
 
 def check_matplotlib() -> None:

@@ -121,7 +121,7 @@ def write_page(
     outputs = {name: charts.chart_file(path, name) for name in draws}
     with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
         for png, draw in zip(pngs, draws.values(), strict=True):
-            with charts.chart(draw, charts.SIZE) as figure:
+            with charts.chart(draw) as figure:
                 charts.save_figure(figure, png)
         temporary.write_text(as_text(text), encoding="utf-8")
     return {"page": path, **outputs}
