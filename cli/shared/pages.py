@@ -154,4 +154,4 @@ def _rendered(gaussians: Gaussians, view: View, virtual_scale: float, title: str
     detail = (
         f"{error:.2f} dB on this view, {kept:,} Gaussians ({kept / max(gaussians.whole, 1):.0%})"
     )
-    return Picture(rendering.image.cpu().numpy(), title, detail)
+    return Picture(rendering.pixels.cpu().numpy(), title, detail)

@@ -9,7 +9,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from clod_adapter.cameras import Scene, View, spread
@@ -63,8 +62,8 @@ def draw(
     for row in report["rows"]:
         (measured,) = evaluate(merged_to(round(row["kept"])), scene.test, 1.0)
         merged.append(measured.as_dict())
-    with new_figure((6.4, 5.6), layout="constrained") as figure:
-        quality_curve(figure, report["rows"], merged, report["base_rows"][0])
+    with new_figure((6.4, 4.0), layout="constrained") as figure:
+        quality_curve(figure.subplots(), report["rows"], merged, report["base_rows"][0])
         save_figure(figure, pictures["curve"])
 
 
@@ -96,8 +95,8 @@ def compared(
         if not times.notes:
             detail += f"\n{taken:.1f} ± {between / 2:.1f} ms a frame"
         with torch.no_grad():
-            image = render(gaussians, view.camera, s).image
-        panels.append(Picture(image.numpy(), title, detail))
+            pixels = render(gaussians, view.camera, s).pixels
+        panels.append(Picture(pixels.numpy(), title, detail))
     return panels
 
 
@@ -108,22 +107,22 @@ def dial_strip(
     each enlarged.
     """
     height, width = panels[0].image.shape[:2]
-    left = crop[0]
-    right = crop[0] + crop[2]
-    top = crop[1]
-    bottom = crop[1] + crop[3]
-    tall = [height / width, crop[3] / crop[2]]
+    left, top, part_width, part_height = crop
+    right = left + part_width
+    bottom = top + part_height
+    tall = [height / width, part_height / part_width]
     cell = 2.6  # inches
     with new_figure((len(panels) * cell, cell * sum(tall) + 1.1), layout="constrained") as figure:
+        from matplotlib.patches import Rectangle
+
         figure.suptitle(title, fontsize=11, weight="bold", x=0.01, ha="left")
         columns = figure.subplots(2, len(panels), height_ratios=tall, squeeze=False).T
         for panel, (whole, part) in zip(panels, columns, strict=True):
-            pixels = panel.image if panel.image.dtype == np.uint8 else np.clip(panel.image, 0, 1)
-            whole.imshow(pixels, interpolation="antialiased", aspect="auto")
-            part.imshow(pixels[top:bottom, left:right], interpolation="nearest", aspect="auto")
-            xs = np.array([left, right, right, left, left])
-            ys = np.array([top, top, bottom, bottom, top])
-            whole.plot(xs - 0.5, ys - 0.5, color="white", linewidth=1.4, scalex=False, scaley=False)
+            whole.imshow(panel.image, aspect="auto")
+            enlarged = panel.image[top:bottom, left:right]
+            part.imshow(enlarged, interpolation="nearest", aspect="auto")
+            corner = left - 0.5, top - 0.5
+            whole.add_patch(Rectangle(corner, part_width, part_height, fill=False, color="white"))
             whole.set_axis_off()
             part.set(xticks=[], yticks=[], frame_on=False)
             part.set_xlabel(f"{panel.title}\n{panel.detail}", fontsize=8.5, linespacing=1.35)
@@ -131,33 +130,27 @@ def dial_strip(
 
 
 def quality_curve(
-    figure: Any,
+    axes: Any,
     rows: Sequence[Mapping[str, float]],
     merged: Sequence[Mapping[str, float]],
     base_row: Mapping[str, float],
 ) -> None:
-    """Draws PSNR, and below it SSIM, against the number of Gaussians kept: the dial, one labelled
-    point per dial value, and the merged base.
+    """Draws PSNR against the number of Gaussians kept: the dial, one labelled point per dial value,
+    and the merged base.
     """
-    title = "Quality against Gaussians, mean over the held-out views"
-    figure.suptitle(title, fontsize=11, weight="bold", x=0.02, ha="left")
-    both = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1])
-    for axes, key, label in zip(both, ("psnr", "ssim"), ("PSNR (dB)", "SSIM"), strict=True):
-        axes.set_xscale("log")
-        axes.margins(x=0.1, y=0.16)
-        for name, some, colour in (("the dial", rows, BLUE), ("merged", merged, ORANGE)):
-            kept = [row["kept"] for row in some]
-            values = [row[key] for row in some]
-            axes.plot(kept, values, "-o", color=colour, linewidth=1.8, label=name)
-        points = [("base", base_row), *((f"{row['virtual_scale']:g}", row) for row in rows)]
-        for text, row in points:
-            place = row["kept"], row[key]
-            axes.annotate(
-                text, place, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5
-            )
-        place = base_row["kept"], base_row[key]
-        axes.plot(*place, "D", color="white", markeredgecolor=INK, markersize=7, zorder=1)
-        axes.set_ylabel(label)
-    both[0].legend(loc="lower right", frameon=False)
+    axes.set_title("Quality against Gaussians, mean over the held-out views", loc="left")
+    axes.set_xscale("log")
+    axes.margins(x=0.1, y=0.16)
+    for name, some, colour in (("the dial", rows, BLUE), ("merged", merged, ORANGE)):
+        points = [(row["kept"], row["psnr"]) for row in some]
+        axes.plot(*zip(*points, strict=True), "-o", color=colour, linewidth=1.8, label=name)
+    base = base_row["kept"], base_row["psnr"]
+    axes.plot(*base, "D", color="white", markeredgecolor=INK, markersize=7, zorder=1, label="base")
+    for row in rows:
+        point = row["kept"], row["psnr"]
+        text = f"{row['virtual_scale']:g}"
+        axes.annotate(text, point, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5)
+    axes.legend(loc="lower right")
+    axes.set_ylabel("PSNR (dB)")
     axes.set_xlabel("Gaussians kept (log scale); the numbers are dial values")
     label_log(axes.xaxis)

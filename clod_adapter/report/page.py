@@ -27,7 +27,7 @@ QUALITY = 88  # of WebP
 
 @dataclass(frozen=True)
 class Picture:
-    """An image, ``[H, W, 3]`` uint8 or float in 0..1, with its caption."""
+    """An image, ``[H, W, 3]`` uint8, with its caption."""
 
     image: np.ndarray
     title: str
@@ -36,14 +36,9 @@ class Picture:
     @property
     def url(self) -> str:
         """The image as WebP in a data: URL, at most WIDEST pixels wide."""
-        image = self.image
-        if image.dtype != np.uint8:
-            image = (image.clip(0, 1) * 255).round().astype("u1")
+        picture = Image.fromarray(self.image)
+        picture.thumbnail((WIDEST, picture.height), Image.Resampling.LANCZOS)
         file = io.BytesIO()
-        picture = Image.fromarray(image)
-        if picture.width > WIDEST:
-            height = round(picture.height * WIDEST / picture.width)
-            picture = picture.resize((WIDEST, height), Image.Resampling.LANCZOS)
         picture.save(file, "WEBP", quality=QUALITY)
         return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
@@ -74,28 +69,7 @@ def write_page(
     series = charts.series_of(report)
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
     drawn = [line for line in series if not (against_base and line.label == charts.BASE)]
-    draws: dict[str, charts.Draw] = {}
-    for name in charts.QUANTITIES if drawn else ():
-        draws[name] = partial(charts.draw_rows, series=drawn, quantity=name)
-    if training:
-        curves = training["curves"]
-        base_psnr = None if against_base else training["base_psnr"]
-        draws["adapting"] = partial(charts.draw_training, curves=curves, base_psnr=base_psnr)
-    tiles = [(line.label, line.rows[0]) for line in drawn if line.label == charts.BASE]
-    if drawn and drawn[0].dial:
-        rows = sorted(drawn[0].rows, key=lambda row: row["virtual_scale"])
-        for k in dict.fromkeys((0, len(rows) // 2, len(rows) - 1)):  # the ends and the middle
-            tiles.append((f"s = {rows[k]['virtual_scale']:g}", rows[k]))
-    settings = {
-        "model": report["model"],
-        "scene": "none (synthetic views)" if against_base else report["scene"],
-        "version": report["version"],
-        **report["machine"],
-        "device": report["device"],
-    }
-    settings |= {f"{name}, seconds": f"{value:.1f}" for name, value in report["seconds"].items()}
-    chosen_frames = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4))
-    strip = [*others.values(), *(frames[k] for k in chosen_frames)] if frames else []
+    draws = _draws(drawn, training, against_base)
     source = files("clod_adapter.report")
     template = (source / "page.html").read_text("utf-8")
     page = jinja2.Environment(autoescape=True).from_string(template)
@@ -107,12 +81,12 @@ def write_page(
         scene="" if against_base else PurePath(abspath(report["scene"])).name,
         series=series,
         drawn=drawn,
-        tiles=tiles,
+        tiles=_tiles(drawn),
         frames=frames,
         others=others,
-        strip=strip,
+        strip=[*others.values(), *frames[:: max(len(frames) // 3, 1)]],
         training=training,
-        settings=settings,
+        settings=_settings(report),
         charts={name: partial(charts.inline_svg, draw, name) for name, draw in draws.items()},
         data=script_json({"report": report, "training": training}),
         style=(source / "style.css").read_text("utf-8"),
@@ -125,3 +99,43 @@ def write_page(
                 charts.save_figure(figure, png)
         temporary.write_text(as_text(text), encoding="utf-8")
     return {"page": path, **outputs}
+
+
+def _draws(
+    series: Sequence[charts.Series], training: Mapping[str, Any] | None, against_base: bool
+) -> dict[str, charts.Draw]:
+    """The functions that draw the charts, by name."""
+    draws: dict[str, charts.Draw] = {}
+    if series:
+        for name in charts.QUANTITIES:
+            draws[name] = partial(charts.draw_rows, series=series, quantity=name)
+    if training:
+        base_psnr = None if against_base else training["base_psnr"]
+        curves = training["curves"]
+        draws["adapting"] = partial(charts.draw_training, curves=curves, base_psnr=base_psnr)
+    return draws
+
+
+def _tiles(series: Sequence[charts.Series]) -> list[tuple[str, Mapping[str, Any]]]:
+    """The rows at the top of the page, by label: the base, and the ends and middle of the dial."""
+    tiles = [(line.label, line.rows[0]) for line in series if line.label == charts.BASE]
+    if series and series[0].dial:
+        rows = sorted(series[0].rows, key=lambda row: row["virtual_scale"])
+        for k in sorted({0, len(rows) // 2, len(rows) - 1}):
+            tiles.append((f"s = {rows[k]['virtual_scale']:g}", rows[k]))
+    return tiles
+
+
+def _settings(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Model, scene, machine and times, by name."""
+    against_base = from_checkpoint(report)
+    settings = {
+        "model": report["model"],
+        "scene": "none (synthetic views)" if against_base else report["scene"],
+        "version": report["version"],
+        **report["machine"],
+        "device": report["device"],
+    }
+    for name, value in report["seconds"].items():
+        settings[f"{name}, seconds"] = f"{value:.1f}"
+    return settings

@@ -134,7 +134,7 @@ def test_adapt(clod, tmp_path):
     assert curves[0]["points"][-1]["seconds"] == pytest.approx(trained, abs=0.05)
     assert "take over in the distance" in text
     assert "base.ply, a trained splat of 300 Gaussians" in text
-    assert text.count("<svg") == 6
+    assert text.count("<svg") == 3
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
 
