@@ -157,7 +157,7 @@ def with_filter(
     gaussians, name = checkpoint.gaussians, args.antialiasing
     if name == "auto":
         with console.status("comparing screen-space filters with the photographs ..."):
-            return detect_filter(checkpoint, views, console.note, "--antialiasing")
+            return detect_filter(checkpoint, views, console.note)
     stored = gaussians.screen_filter
     if checkpoint.filter_known and FILTERS[name] != stored:
         console.note(
@@ -254,8 +254,7 @@ def align_shown(
 ) -> tuple[Scene, Report]:
     """``align``, with a status line on a terminal."""
     with console.status("comparing the checkpoint with the photographs ..."):
-        override = "use --misaligned-ok"
-        return align(checkpoint, scene, console.note, required=required, override=override)
+        return align(checkpoint, scene, console.note, required=required)
 
 
 def read_cameras(

@@ -32,13 +32,9 @@ def align(
     note: Note,
     *,
     required: bool,
-    override: str = "pass misaligned_ok=True",
 ) -> tuple[Scene, dict[str, Any]]:
     """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements
     for the report.
-
-    Args:
-        override: how the user says that a fit is not ``required``, for the error.
 
     Raises:
         ClodError: the checkpoint fits in no frame, and that is ``required``; if not, there is a
@@ -54,7 +50,7 @@ def align(
     elif guess or not alignment.fits:
         message = f"{ply}: does not match {images}: {mismatch(alignment, guess)}"
         if required:
-            raise ClodError(f"{message}; {override} to train anyway")
+            raise ClodError(f"{message}; --misaligned-ok (misaligned_ok in Python) trains anyway")
         note(f"warning: {message}")
     elif required and not alignment.views:
         note(f"warning: the photographs in {images}, to train on, have a single colour each")
@@ -92,10 +88,7 @@ def compare_frames(
 
 def mismatch(alignment: Alignment, guess: Guess | None) -> str:
     """The measurements, and a remedy."""
-    share = (
-        f"{alignment.in_view:.2g}" if 0 < alignment.in_view < 0.01 else f"{alignment.in_view:.0%}"
-    )
-    facts = f"{share} of its Gaussians are in view"
+    facts = f"{alignment.in_view:.2%} of its Gaussians are in view"
     if alignment.views:
         facts = (
             f"renders have a PSNR of {alignment.psnr:.1f} dB against {alignment.views} photographs,"
@@ -114,13 +107,9 @@ def mismatch(alignment: Alignment, guess: Guess | None) -> str:
     return f"{facts}; give the checkpoint of this scene, in the cameras' frame"
 
 
-def detect_filter(
-    checkpoint: Checkpoint, views: Sequence[View], note: Note, option: str = ""
-) -> Checkpoint:
+def detect_filter(checkpoint: Checkpoint, views: Sequence[View], note: Note) -> Checkpoint:
     """The checkpoint with its file's screen-space filter; if that has none, with the one that fits
     ``views`` best.
-
-    ``option`` is one of the command line that overrides this, for the note.
     """
     if checkpoint.filter_known or not views:
         return checkpoint
@@ -128,12 +117,9 @@ def detect_filter(
     expected = gaussians.screen_filter.name or "off"
     name, psnr = compare_filters(gaussians, views, expected)
     if name != expected:
-        comparison = ", ".join(
-            f"{psnr[filter_name]:.2f} dB {WORDS[filter_name]}" for filter_name in (name, expected)
+        note(
+            f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}:"
+            f" {psnr[name]:.2f} dB {WORDS[name]}, {psnr[expected]:.2f} dB {WORDS[expected]};"
+            f" rendered so (--antialiasing {expected} overrides it, filter_known=True in Python)"
         )
-        trained = (
-            f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {comparison}"
-        )
-        override = f" ({option} {expected} overrides it)" if option else ""
-        note(f"{trained}; rendered so{override}")
     return replace(checkpoint, gaussians=gaussians.replace(screen_filter=FILTERS[name]))

@@ -10,7 +10,6 @@ correlation) and another background (by a render over white).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -72,7 +71,7 @@ class Alignment:
     @property
     def doubtful(self) -> bool:
         """Whether another frame may explain the photographs better."""
-        return not self.on_white and not (self.fits and not self.margin < DOUBTFUL)
+        return not self.on_white and (not self.fits or self.margin < DOUBTFUL)
 
     @property
     def on_white(self) -> bool:
@@ -155,25 +154,17 @@ def compare_filters(
     fainter is closer).
     """
     views = spread(views, MOST_VIEWS)
-    photographs = [unit(view.image, gaussians.means) for view in views]
-    deviations = [photograph - photograph.mean((0, 1)) for photograph in photographs]
-    constant = fmean(float(deviation.square().mean()) for deviation in deviations)
-    rows = []
+    tables = []
     for screen_filter in FILTERS.values():
-        filtered = gaussians.replace(screen_filter=screen_filter)
-        errors = []
-        for view, photograph in zip(views, photographs, strict=True):
-            image = render(filtered, view.camera).image.clamp(0, 1)
-            errors.append((image - photograph).square().mean())
-        rows.append(torch.stack(errors))
-    error = torch.stack(rows)
+        tables.append(compare_renders(gaussians.replace(screen_filter=screen_filter), views))
+    error, _, constant, _, _ = torch.stack(tables).unbind(2)  # by filter and view
     psnr = -10 * error.clamp(min=1e-10).log10()
     names = list(FILTERS)
     gained = psnr - psnr[names.index(expected)]
     means = psnr.mean(1)
     clear = gained.mean(1) > CLEAR_FILTER
     clear &= (gained > 0).float().mean(1) >= AGREEING
-    clear &= error.mean(1) < constant * 10 ** (-DOUBTFUL / 10)
+    clear &= error.mean(1) < constant.mean(1) * 10 ** (-DOUBTFUL / 10)
     best = expected
     if bool(clear.any()):
         best = names[int(means.where(clear, -math.inf).argmax())]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 GSPLAT = (
@@ -23,6 +23,8 @@ NERFSTUDIO = (
     "the checkpoint is in nerfstudio's normalized frame: copy dataparser_transforms.json to the"
     " scene"
 )
+AXES = ("x", "y", "z", "-x", "-y", "-z")
+ROUNDS = 20  # of the reweighted least squares
 # Rotations of COLMAP's world in nerfstudio's readers before normalization: none, the current one,
 # the older one.
 NERFSTUDIO_TURNS = (
@@ -32,15 +34,15 @@ NERFSTUDIO_TURNS = (
 )
 
 
+# Poses that COLMAP's differ from: name, whether they are camera to world, whether the cameras look
+# along -z with y up, and what to do.
 POSES = (
     (
         "OpenGL poses",
         False,
         True,
-        (
-            "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down:"
-            " negate the y and z axes of their poses"
-        ),
+        "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down:"
+        " negate the y and z axes of their poses",
     ),
     (
         "inverted poses",
@@ -52,10 +54,8 @@ POSES = (
         "inverted OpenGL poses",
         True,
         True,
-        (
-            "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera:"
-            " negate their y and z axes and invert them"
-        ),
+        "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera:"
+        " negate their y and z axes and invert them",
     ),
 )
 
@@ -78,15 +78,16 @@ class Frame:
         """``[V, 4, 4]`` float64, world to camera in the file's frame, of cameras as they were
         given.
         """
-        viewmats = torch.linalg.inv(viewmats.double()) if self.inverted else viewmats.double()
+        viewmats = viewmats.double()
+        if self.inverted:
+            viewmats = torch.linalg.inv(viewmats)
         if self.opengl:
             viewmats = torch.diag(viewmats.new_tensor([1.0, -1, -1, 1])) @ viewmats
         return into_file(viewmats, self.rotation, self.scale, self.offset)
 
     def as_dict(self) -> dict[str, Any]:
-        """The fields but ``description``, for reports."""
-        fields = {name: value for name, value in vars(self).items() if name != "description"}
-        return fields | {"rotation": self.rotation.tolist(), "offset": self.offset.tolist()}
+        """The fields, for reports."""
+        return vars(self) | {"rotation": self.rotation.tolist(), "offset": self.offset.tolist()}
 
 
 def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
@@ -111,12 +112,9 @@ def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) 
     return out
 
 
-def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
-    """``[3]`` the least-squares point closest to the optical axes; the mean centre if they are
-    parallel.
-
-    After many ``rounds``, weighted by inverse distances, of least distances: one far camera does
-    not decide it.
+def focus_of(viewmats: Tensor) -> Tensor:
+    """``[3]`` the point of least distances to the optical axes, by reweighted least squares: one
+    far camera does not decide it. The mean centre if the axes are parallel.
     """
     poses = torch.linalg.inv(viewmats.double())
     centres = poses[:, :3, 3]
@@ -126,7 +124,7 @@ def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
     if float(torch.linalg.cond(across.mean(0))) > 1e4:
         return centres.mean(0)
     weights = across.new_ones(len(across))
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         rows = weights[:, None, None] * across
         products = (rows @ centres[:, :, None]).mean(0)
         focus = torch.linalg.solve(rows.mean(0), products)[:, 0]
@@ -139,15 +137,12 @@ def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
 def _axes(viewmats: Tensor) -> Iterator[Frame]:
     """The 47 other signed permutations of the axes, including mirrored ones."""
     identity = torch.eye(3, dtype=viewmats.dtype)
-    for order, signs in itertools.product(
-        itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)
-    ):
-        rotation = torch.diag(viewmats.new_tensor(signs)) @ identity[list(order)]
-        if rotation.equal(identity):
+    rows = torch.cat([identity, -identity])
+    for order in itertools.permutations(range(6), 3):
+        rotation = rows[list(order)]
+        if rotation.equal(identity) or torch.linalg.det(rotation) == 0:
             continue
-        names = ", ".join(
-            ("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True)
-        )
+        names = ", ".join(AXES[k] for k in order)
         mirrored = " (mirrored)" if torch.linalg.det(rotation) < 0 else ""
         text = (
             f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without"
@@ -210,17 +205,6 @@ def _normalized(
 
 
 def _turning(source: Tensor, target: Tensor) -> Tensor:
-    """The smallest rotation from one direction to another (Rodrigues); half a turn for opposite
-    directions.
-    """
-    a = F.normalize(source, dim=0)
-    b = F.normalize(target, dim=0)
-    identity = torch.eye(3, dtype=a.dtype)
-    cosine = float(a @ b)
-    if cosine < -1 + 1e-8:
-        axis = identity[int(b.abs().argmin())]
-        across = F.normalize(torch.linalg.cross(b, axis), dim=0)
-        return 2 * torch.outer(across, across) - identity
-    normal = torch.linalg.cross(a, b)
-    skew = torch.linalg.cross(identity, normal.expand(3, 3))
-    return identity + skew + skew @ skew / (1 + cosine)
+    """The smallest rotation from one direction to another."""
+    rotation, _ = Rotation.align_vectors(target.numpy(), source.numpy())
+    return torch.from_numpy(rotation.as_matrix())

@@ -30,7 +30,6 @@ FINER = ((240, 20_000, (0.01, 0.001)), (480, 60_000, (0.001, 0.0001)))
 SMALL_RENDERS = 4  # number of small renders
 SCALES = [10 ** (k / 12) for k in range(-24, 25)]  # a hundredth to a hundred, in steps of 21 %
 LOWEST_CORRELATION = 0.5  # after the coarse search; below it the search ends
-ROUNDS = 20  # of the point that most cameras look at
 MOST_TRIALS = 80  # of a pattern search, which usually takes a dozen steps
 BETTER_THAN_MEAN = 1.5  # dB
 
@@ -115,20 +114,19 @@ def _search(
 ) -> Frame | None:
     """The best scale and offset; None if no correlation reaches LOWEST_CORRELATION.
 
-    Climbs to the nearest maximum from the best scale about the origin, and from the best ones about
-    the points that all and most cameras look at, with the median of the Gaussians moved there.
+    Climbs to the nearest maximum from the best scale about the origin, and from the best one about
+    the point that most cameras look at, with the median of the Gaussians moved there.
     """
     middle = gaussians.means.double().median(dim=0).values.cpu()  # where cameras are
     centres = torch.linalg.inv(viewmats)[:, :3, 3]
+    focus = focus_of(viewmats)
+    unit = float((centres - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
     climbs = []
-    for towards, rounds in ((0.0, 1), (1.0, 1), (1.0, ROUNDS)):
-        focus = focus_of(viewmats, rounds)
-        distances = (centres - focus).norm(dim=1)
-        unit = float(distances.quantile(0.5).clamp(min=1e-9))
+    for towards in (0.0, 1.0):
         places = [_placed(scale, towards * (focus - scale * middle)) for scale in SCALES]
         start = max(places, key=score)
-        climbs.append((_climb(score, start, focus, unit, (0.1, 0.02)), focus, unit))
-    (best, frame), focus, unit = max(climbs, key=lambda climb: climb[0][0])
+        climbs.append(_climb(score, start, focus, unit, (0.1, 0.02)))
+    best, frame = max(climbs, key=lambda climb: climb[0])
     if not best >= LOWEST_CORRELATION:
         return None
     for width, most, steps in FINER:
@@ -165,12 +163,12 @@ def _climb(
         moves[1::2] *= -1
         neighbours = [_placed(frame.scale, frame.offset + move) for move in moves]
         for factor in (1 + step, 1 / (1 + step)):
-            neighbours.append(
-                _placed(frame.scale * factor, focus - factor * (focus - frame.offset))
-            )
+            offset = focus - factor * (focus - frame.offset)
+            neighbours.append(_placed(frame.scale * factor, offset))
         for neighbour in neighbours:
             trials += 1
-            if (value := score(neighbour)) > best:
+            value = score(neighbour)
+            if value > best:
                 best = value
                 frame = neighbour
                 break
