@@ -14,7 +14,7 @@ NOWHERE: Origin = (0.0, 0.0, 0.0)
 # Times the spread of the scene. Closer to 0, float32 resolves 1e-5 of the spread, and the origin
 # stays 0.
 FAR = 100.0
-SAMPLE = 1 << 18  # rows that it is found from, evenly spread; more would take memory
+SAMPLE = 1 << 18  # rows that it is found from, evenly spread
 FINEST = 2.0**-40  # of the distance from 0: the finest unit that an origin is rounded to
 
 
@@ -27,24 +27,18 @@ def origin_of(means: np.ndarray) -> Origin:
     """
     import numpy as np  # here: --help needs none
 
-    means = means[:: len(means) // SAMPLE + 1]
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        finite = np.isfinite(means).all(1)
-    if not finite.any():
-        return NOWHERE
-    shares = (0.1, 0.5, 0.9)  # axis by axis, which takes a third of the memory
-    quantiles = [
-        np.quantile(means[:, k][finite], shares, method="nearest", overwrite_input=True)
-        for k in range(3)
-    ]
-    low, middle, high = np.stack(quantiles, 1).astype(np.float64)
-    with np.errstate(over="ignore"):  # of doubles
+    with np.errstate(over="ignore", invalid="ignore"):  # doubles, signalling NaN
+        sample = means[:: len(means) // SAMPLE + 1].astype(np.float64)
+        sample = sample[np.isfinite(sample).all(1)]
+        if not len(sample):
+            return NOWHERE
+        low, middle, high = np.quantile(sample, (0.1, 0.5, 0.9), axis=0, method="nearest")
         spread = float((high - low).max())
-    if not 0 < FAR * spread < float(np.abs(middle).max()):
+    distance = float(np.abs(middle).max())
+    if not 0 < FAR * spread < distance:
         return NOWHERE
     # The spread of doubles may be below the precision of the largest.
-    finest = FINEST * float(np.abs(middle).max())
-    unit = 2.0 ** math.ceil(math.log2(max(spread, finest)))
+    unit = 2.0 ** math.ceil(math.log2(max(spread, FINEST * distance)))
     x, y, z = (float(value) for value in np.round(middle / unit) * unit + 0.0)  # no -0
     return x, y, z
 
@@ -66,5 +60,4 @@ def relative(means: np.ndarray, at: Sequence[float], origin: Sequence[float]) ->
     with np.errstate(over="ignore", invalid="ignore"):
         if tuple(at) == tuple(origin):
             return means.astype(np.float32, copy=False)
-        wide = means.astype(np.float64)
-        return ((wide + at if any(at) else wide) - origin).astype(np.float32)
+        return (means.astype(np.float64) + at - origin).astype(np.float32)

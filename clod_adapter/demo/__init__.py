@@ -15,7 +15,6 @@ from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.budget import matching_dial
 from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, importance
 from clod_adapter.initialization.merging import merge
@@ -23,11 +22,12 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
-from clod_adapter.report.charts import BLUE, INK, ORANGE, label_log, new_figure, save_figure
+from clod_adapter.report import charts
 from clod_adapter.report.page import Picture
 
 SHARE = 0.2  # of the Gaussians, beside all
 TITLE = "A held-out view: the checkpoint, and two ways to draw a fifth of its Gaussians"
+FRAMES = 9  # of a panel, whose median time is given
 VIEW = 0  # the held-out view on the strip: across the whole room
 CROP = (150, 150, 150, 75)  # left, top, width and height of the part shown enlarged, pixels
 
@@ -62,9 +62,13 @@ def draw(
     for row in report["rows"]:
         (measured,) = evaluate(merged_to(round(row["kept"])), scene.test, 1.0)
         merged.append(measured.as_dict())
-    with new_figure((6.4, 4.0), layout="constrained") as figure:
-        quality_curve(figure.subplots(), report["rows"], merged, report["base_rows"][0])
-        save_figure(figure, pictures["curve"])
+    series = [
+        charts.Series("the dial", report["rows"], dial=True),
+        charts.Series(charts.BASE, report["base_rows"]),
+        charts.Series("merged to as many", merged),
+    ]
+    with charts.chart(partial(charts.draw_rows, series=series, quantity="count")) as figure:
+        charts.save_figure(figure, pictures["curve"])
 
 
 def merging(base: Gaussians, scene: Scene) -> Callable[[int], Gaussians]:
@@ -76,7 +80,7 @@ def compared(
     base: Gaussians, model: Gaussians, view: View, merged_to: Callable[[int], Gaussians]
 ) -> list[Picture]:
     """Panels of one view: the base, the dial at SHARE of the Gaussians, and the base merged to as
-    many. Frame times are left out where the machine is busy.
+    many.
     """
     s = matching_dial(model, [view.camera], SHARE * len(base))
     (row,) = evaluate(model, [view], s)
@@ -85,15 +89,10 @@ def compared(
         (f"the dial at s = {s:.2g}", model, s),
         ("the checkpoint, merged to as many", merged_to(round(row.kept)), 1.0),
     ]
-    times = time_frames([(gaussians, [s]) for _, gaussians, s in shown], [view.camera])
     panels = []
-    for (title, gaussians, s), (taken,), (between,) in zip(
-        shown, times.milliseconds, times.ranges, strict=True
-    ):
-        (row,) = evaluate(gaussians, [view], s)
-        detail = f"{row.kept:,.0f} Gaussians, {row.psnr:.1f} dB"
-        if not times.notes:
-            detail += f"\n{taken:.1f} ± {between / 2:.1f} ms a frame"
+    for title, gaussians, s in shown:
+        (row,) = evaluate(gaussians, [view] * FRAMES, s)
+        detail = f"{row.kept:,.0f} Gaussians, {row.psnr:.1f} dB\n{row.frame_ms:.1f} ms a frame"
         with torch.no_grad():
             pixels = render(gaussians, view.camera, s).pixels
         panels.append(Picture(pixels.numpy(), title, detail))
@@ -112,7 +111,8 @@ def dial_strip(
     bottom = top + part_height
     tall = [height / width, part_height / part_width]
     cell = 2.6  # inches
-    with new_figure((len(panels) * cell, cell * sum(tall) + 1.1), layout="constrained") as figure:
+    inches = len(panels) * cell, cell * sum(tall) + 1.1
+    with charts.new_figure(inches, layout="constrained") as figure:
         from matplotlib.patches import Rectangle
 
         figure.suptitle(title, fontsize=11, weight="bold", x=0.01, ha="left")
@@ -126,31 +126,4 @@ def dial_strip(
             whole.set_axis_off()
             part.set(xticks=[], yticks=[], frame_on=False)
             part.set_xlabel(f"{panel.title}\n{panel.detail}", fontsize=8.5, linespacing=1.35)
-        save_figure(figure, path)
-
-
-def quality_curve(
-    axes: Any,
-    rows: Sequence[Mapping[str, float]],
-    merged: Sequence[Mapping[str, float]],
-    base_row: Mapping[str, float],
-) -> None:
-    """Draws PSNR against the number of Gaussians kept: the dial, one labelled point per dial value,
-    and the merged base.
-    """
-    axes.set_title("Quality against Gaussians, mean over the held-out views", loc="left")
-    axes.set_xscale("log")
-    axes.margins(x=0.1, y=0.16)
-    for name, some, colour in (("the dial", rows, BLUE), ("merged", merged, ORANGE)):
-        points = [(row["kept"], row["psnr"]) for row in some]
-        axes.plot(*zip(*points, strict=True), "-o", color=colour, linewidth=1.8, label=name)
-    base = base_row["kept"], base_row["psnr"]
-    axes.plot(*base, "D", color="white", markeredgecolor=INK, markersize=7, zorder=1, label="base")
-    for row in rows:
-        point = row["kept"], row["psnr"]
-        text = f"{row['virtual_scale']:g}"
-        axes.annotate(text, point, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5)
-    axes.legend(loc="lower right")
-    axes.set_ylabel("PSNR (dB)")
-    axes.set_xlabel("Gaussians kept (log scale); the numbers are dial values")
-    label_log(axes.xaxis)
+        charts.save_figure(figure, path)

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig, number, require
+from clod_adapter.config import number, require
 from clod_adapter.equation.attenuation import dial, kept_between, smallest_dial
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
@@ -88,33 +88,34 @@ def dial_for(
         raise ClodError(
             f"dial_for needs exactly one of keep, psnr_drop and fps, {len(given)} are given"
         )
-    require(
-        isinstance(gaussians, Gaussians),
-        "gaussians",
-        f"a {type(gaussians).__name__}",
-        "of type Gaussians",
-    )
+    _check_sources(gaussians, cameras)
+    ((name, value),) = given.items()
+    require(0 < number(value) < math.inf, name, value, "a positive, finite number")
+    if keep is not None:
+        return _for_count(gaussians, cameras, baked, keep)
+    if psnr_drop is not None:
+        return _for_psnr_drop(calibration, psnr_drop)
+    if calibration:
+        times = [(row.virtual_scale, row.frame_ms) for row in calibration.rows]
+    else:
+        whole = [camera for camera in cameras if isinstance(camera, Camera)]
+        times, _ = frame_times(gaussians, whole)
+    return dial_for_times(times, value)
+
+
+def _check_sources(gaussians: Gaussians, cameras: Sequence[Place]) -> None:
+    found = type(gaussians).__name__
+    require(isinstance(gaussians, Gaussians), "gaussians", f"a {found}", "of type Gaussians")
     places = isinstance(cameras, Sequence) and all(isinstance(each, Place) for each in cameras)
     if cameras and not places:
         raise ClodError(
             "cameras must be a list of cameras or viewpoints; of views [view.camera for view in"
             " views]"
         )
-    ((name, value),) = given.items()
-    require(0 < number(value) < math.inf, name, value, "a positive, finite number")
-    if gaussians.sigma_d is None or gaussians.attenuation is None:
+    if gaussians.sigma_d is None:
         raise ClodError(
             "the Gaussians have no sigma_d, so no dial value meets a budget; adapt them first"
         )
-    if name == "keep":
-        return _for_count(gaussians, gaussians.attenuation, cameras, baked, value)
-    if name == "psnr_drop":
-        return _for_psnr_drop(calibration, value)
-    stored = (
-        [(row.virtual_scale, row.frame_ms) for row in calibration.rows] if calibration else None
-    )
-    whole = [camera for camera in cameras if isinstance(camera, Camera)]
-    return dial_for_times(stored or frame_times(gaussians, whole)[0], value)
 
 
 def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValue:
@@ -171,17 +172,14 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
 
 @torch.no_grad()
 def _for_count(
-    gaussians: Gaussians,
-    config: AttenuationConfig,
-    cameras: Sequence[Place],
-    baked: bool,
-    keep: float,
+    gaussians: Gaussians, cameras: Sequence[Place], baked: bool, keep: float
 ) -> DialValue:
     """Counts Gaussians at their distances from each camera, or with ``baked`` at one distance over
     all cameras.
     """
+    config = gaussians.attenuation
+    assert config is not None
     views = [cameras] if baked or not cameras else [[camera] for camera in cameras]
-    largest = config.max_sv
     wanted = math.floor(keep * len(views))
 
     @lru_cache(maxsize=1)  # all at once would be views times Gaussians
@@ -196,20 +194,17 @@ def _for_count(
         return sum(int(kept_in(k)(virtual_scale).sum()) for k in range(len(views)))
 
     most = count(1.0)
-    fewest = count(largest)
-    if wanted >= most:
-        note = (
-            f"s = 1 keeps {most / len(views):,.0f} of {gaussians.whole:,} already"
-            if wanted > most
-            else ""
-        )
+    if wanted == most:
+        return DialValue(1.0)
+    if wanted > most:
+        note = f"s = 1 keeps {most / len(views):,.0f} of {gaussians.whole:,} already"
         return DialValue(1.0, note)
+    largest = config.max_sv
     note = ""
-    if wanted < fewest:
+    if wanted < count(largest):
         note = f"beyond s = {largest:g}, the largest dial value it was trained for"
-        while fewest > wanted and largest < BEYOND * config.max_sv:
-            largest *= 2
-            fewest = count(largest)
+        largest *= BEYOND
+        fewest = count(largest)
         if fewest > wanted:
             raise ClodError(
                 f"{keep:,.0f} Gaussians are out of reach: {fewest / len(views):,.0f} remain at any"

@@ -39,20 +39,18 @@ def with_frame_times(
     """The rows of each model with frame times that can be compared (``time_frames``), and notes on
     them.
     """
-    jobs = []
-    for model, rows in measured:
-        jobs.append((model, sorted({row.virtual_scale for row in rows})))
+    jobs = [(model, [row.virtual_scale for row in rows]) for model, rows in measured]
     times = time_frames(jobs, [view.camera for view in views], progress)
-    found = list[list[Row]]()
-    for (_, rows), (_, dials), milliseconds, ranges in zip(
-        measured, jobs, times.milliseconds, times.ranges, strict=True
+    timed = []
+    for (_, rows), milliseconds, ranges in zip(
+        measured, times.milliseconds, times.ranges, strict=True
     ):
-        timed = list[Row]()
-        for row in rows:
-            k = dials.index(row.virtual_scale)
-            timed.append(replace(row, frame_ms=milliseconds[k], frame_ms_range=ranges[k]))
-        found.append(timed)
-    return found, times.notes
+        timed.append(list(map(_with_time, rows, milliseconds, ranges)))
+    return timed, times.notes
+
+
+def _with_time(row: Row, frame_ms: float, frame_ms_range: float) -> Row:
+    return replace(row, frame_ms=frame_ms, frame_ms_range=frame_ms_range)
 
 
 def calibrate(

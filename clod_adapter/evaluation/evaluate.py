@@ -84,32 +84,20 @@ def evaluate(
         raise ClodError("there are no dial values to evaluate at")
     for virtual_scale in virtual_scales:
         check_dial(virtual_scale)
-    virtual_scales = [float(s) for s in virtual_scales]
     gaussians = gaussians.without_empty_bands()
-    dials = virtual_scales if gaussians.sigma_d is not None else [1.0] * len(virtual_scales)
+    dials = [1.0 if gaussians.sigma_d is None else float(s) for s in virtual_scales]
     render(gaussians, views[0].camera, max(dials))  # compiled and warm before the clock starts
     rows = list[Row]()
-    for i, virtual_scale in enumerate(virtual_scales):
+    for virtual_scale, dial in zip(virtual_scales, dials, strict=True):
         measured = list[_Measured]()
-        for measured_view in _measured(gaussians, views, dials[i]):
+        for measured_view in _measured(gaussians, views, dial):
             measured.append(measured_view)
-            done = i * len(views) + len(measured)
-            now = Progress(Phase.EVALUATION, done, len(virtual_scales) * len(views))
+            done = len(rows) * len(views) + len(measured)
+            now = Progress(Phase.EVALUATION, done, len(dials) * len(views))
             stopped = progress is not None and progress(now) is False
             if stopped and len(measured) < len(views):
                 return rows
-        kept = statistics.fmean(view.kept for view in measured)
-        rows.append(
-            Row(
-                virtual_scale,
-                psnr=statistics.fmean(view.psnr for view in measured),
-                ssim=statistics.fmean(view.ssim for view in measured),
-                kept=kept,
-                kept_share=kept / max(gaussians.whole, 1),
-                in_view=statistics.fmean(view.in_view for view in measured),
-                frame_ms=1e3 * statistics.median(view.seconds for view in measured),
-            )
-        )
+        rows.append(_row(float(virtual_scale), measured, gaussians.whole))
         if stopped:
             break
     return rows
@@ -141,6 +129,19 @@ class _Measured(NamedTuple):
     ssim: float
     kept: int
     in_view: int
+
+
+def _row(virtual_scale: float, measured: Sequence[_Measured], total: int) -> Row:
+    kept = statistics.fmean(view.kept for view in measured)
+    return Row(
+        virtual_scale,
+        psnr=statistics.fmean(view.psnr for view in measured),
+        ssim=statistics.fmean(view.ssim for view in measured),
+        kept=kept,
+        kept_share=kept / max(total, 1),
+        in_view=statistics.fmean(view.in_view for view in measured),
+        frame_ms=1e3 * statistics.median(view.seconds for view in measured),
+    )
 
 
 def _measured(

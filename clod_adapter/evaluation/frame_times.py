@@ -27,13 +27,12 @@ FEWEST = 3
 # after which no pass begins, once there are FEWEST; a pass that would take a third of it has one
 # view
 SECONDS = 10.0
-# the warm-up ends with two frames whose times differ by a tenth
+# the warm-up, which ends with the first of them
 WARM_FRAMES = 8
 WARM_SECONDS = 2.0
-STEADY = 0.1
 NOISY = 0.2  # a larger range of the passes, as a share of the time, is reported
 
-Model = tuple[Gaussians, Sequence[float]]  # and the dial values, ascending, to time it at
+Model = tuple[Gaussians, Sequence[float]]  # and the dial values to time it at
 
 
 @dataclass(frozen=True)
@@ -67,16 +66,14 @@ class FrameTimes:
 def time_frames(
     models: Sequence[Model], cameras: Sequence[Camera], progress: Listener | None = None
 ) -> FrameTimes:
-    """Times frames from at most three of the cameras, evenly spread; the first dial value of all is
-    the slowest.
-    """
+    """Times frames from at most three of the cameras, evenly spread."""
     if not cameras:
         raise ClodError("frames a second need a calibration or cameras to time frames from")
     jobs = list[tuple[Gaussians, float]]()
     for model, dials in models:
         model = model.without_empty_bands()
         jobs += [(model, 1.0 if model.sigma_d is None else s) for s in dials]
-    slowest = _warm_up(*jobs[0], cameras[0])
+    slowest = _warm_up(*min(jobs, key=lambda job: job[1]), cameras[0])
     views = cameras[:: -(-len(cameras) // VIEWS)]
     if slowest * len(views) * len(jobs) > SECONDS / FEWEST:
         views = views[len(views) // 2 :][:1]
@@ -100,16 +97,12 @@ def time_frames(
 
 
 def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
-    """Renders until the times are steady, with compiled functions and a raised clock rate; the last
-    time, seconds.
-    """
+    """Renders until functions are compiled and the clock rate is raised; the last time, seconds."""
     began = time.perf_counter()
-    before = 0.0
     for _ in range(WARM_FRAMES):
-        taken = timed_frame(gaussians, camera, virtual_scale)[1]
-        if abs(taken - before) <= STEADY * taken or time.perf_counter() - began > WARM_SECONDS:
+        _, taken = timed_frame(gaussians, camera, virtual_scale)
+        if time.perf_counter() - began >= WARM_SECONDS:
             break
-        before = taken
     return taken
 
 

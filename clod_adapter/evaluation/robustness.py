@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
+import numpy as np
 
 from clod_adapter.adapter import Adapter, detach
 from clod_adapter.cameras import Scene, View
@@ -96,9 +96,8 @@ def distribution(gaussians: Gaussians) -> dict[str, Any]:
         columns["log10_sigma_d"] = gaussians.sigma_d.clamp(min=1e-30).log10(), LOG_SIGMA_EDGES
     histograms = {}
     for name, (values, edges) in columns.items():
-        inner = torch.tensor(edges[1:-1], dtype=torch.float32)
-        bins = torch.bucketize(values.detach().cpu().float(), inner, right=True)
-        counts = bins.bincount(minlength=len(edges) - 1)
+        inside = values.detach().cpu().clamp(edges[0], edges[-1])
+        counts, _ = np.histogram(inside, edges)
         shares = counts / max(len(values), 1)
         histograms[name] = {"edges": list(edges), "shares": shares.tolist()}
     return histograms
