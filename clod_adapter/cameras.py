@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from numbers import Integral
 from pathlib import Path
 from typing import Any, TypeVar
@@ -69,7 +68,7 @@ class Camera:
                 " least 0"
             )
         if self.viewmat.device.type == self.K.device.type == "cpu":  # the host would wait for a GPU
-            _check_matrices(self.name, self.viewmat.tolist(), self.K.tolist())
+            _check_matrices(self.name, self.viewmat, self.K)
 
     def __repr__(self) -> str:
         return f"Camera({self.name!r}, {self.width}x{self.height})"
@@ -126,23 +125,22 @@ def numbers_of(name: str, values: Any) -> Tensor:
         raise ClodError(f"{name} is {values!r:.80}, it must be an array of numbers") from error
 
 
-def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]]) -> None:
+def _check_matrices(name: str, viewmat: Tensor, K: Tensor) -> None:
     """Rejects what is no pinhole camera."""
-    (fx, skew, _), (other_skew, fy, _), last = K
-    turn = torch.tensor(viewmat, dtype=torch.float64)[:3, :3]
+    (fx, skew, _), (other_skew, fy, _), last = K.tolist()
+    turn = viewmat[:3, :3].double()
     bent = (turn @ turn.T - torch.eye(3).to(turn)).abs().max()
-    moves = bent < BENT and viewmat[3] == [0, 0, 0, 1]
-    for ok, defect in (
-        (all(map(math.isfinite, chain(*viewmat, *K))), "a value that is not finite"),
-        (moves, "a viewmat that is no rotation and translation"),
-        (fx > 0 and fy > 0, "a focal length that is not positive"),
-        (
-            skew == other_skew == 0 and last == [0, 0, 1],
-            "a K with skew, or whose last row is not 0, 0, 1",
-        ),
-    ):
-        if not ok:
-            raise ClodError(f"camera {name!r} has {defect}")
+    defect = ""
+    if not (viewmat.isfinite().all() and K.isfinite().all()):
+        defect = "a value that is not finite"
+    elif bent >= BENT or viewmat[3].tolist() != [0, 0, 0, 1]:
+        defect = "a viewmat that is no rotation and translation"
+    elif fx <= 0 or fy <= 0:
+        defect = "a focal length that is not positive"
+    elif skew != 0 or other_skew != 0 or last != [0, 0, 1]:
+        defect = "a K with skew, or whose last row is not 0, 0, 1"
+    if defect:
+        raise ClodError(f"camera {name!r} has {defect}")
 
 
 @dataclass(frozen=True, eq=False)

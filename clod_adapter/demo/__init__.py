@@ -106,7 +106,8 @@ def dial_strip(
     each enlarged.
     """
     height, width = panels[0].image.shape[:2]
-    left, top, part_width, part_height = crop
+    left, top = crop[:2]
+    part_width, part_height = crop[2:]
     right = left + part_width
     bottom = top + part_height
     tall = [height / width, part_height / part_width]

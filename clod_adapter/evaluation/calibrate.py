@@ -39,7 +39,9 @@ def with_frame_times(
     """The rows of each model with frame times that can be compared (``time_frames``), and notes on
     them.
     """
-    jobs = [(model, [row.virtual_scale for row in rows]) for model, rows in measured]
+    jobs = []
+    for model, rows in measured:
+        jobs.append((model, [row.virtual_scale for row in rows]))
     times = time_frames(jobs, [view.camera for view in views], progress)
     timed = []
     for (_, rows), milliseconds, ranges in zip(

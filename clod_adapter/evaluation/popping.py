@@ -23,7 +23,7 @@ too.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -145,21 +145,18 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
         raise ClodError(f"a camera path needs at least two cameras, not {len(cameras)}")
     first = cameras[0]
     viewmats = np.stack([float64_array(camera.viewmat) for camera in cameras])
-    centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    poses = np.linalg.inv(viewmats)
+    centres = poses[:, :3, 3]
     lengths = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     lengths = np.maximum(lengths, 1e-9 * lengths.sum() or 1.0)
     places = np.concatenate([[0.0], lengths.cumsum()])
     at = np.linspace(0, places[-1], steps + 1)
-    poses = np.tile(np.eye(4), (steps + 1, 1, 1))
-    rotations = Slerp(places, Rotation.from_matrix(viewmats[:, :3, :3]))
-    poses[:, :3, :3] = rotations(at).as_matrix()
-    moved = np.stack([np.interp(at, places, axis) for axis in centres.T], 1)
-    poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], moved)
-    path_viewmats = torch.from_numpy(poses).to(first.viewmat)
-    return [
-        Camera(viewmat, first.K, first.width, first.height, near=first.near)
-        for viewmat in path_viewmats
-    ]
+    rotations = Slerp(places, Rotation.from_matrix(poses[:, :3, :3]))
+    moved = np.tile(np.eye(4), (steps + 1, 1, 1))
+    moved[:, :3, :3] = rotations(at).as_matrix()
+    moved[:, :3, 3] = np.stack([np.interp(at, places, axis) for axis in centres.T], 1)
+    path_viewmats = torch.from_numpy(np.linalg.inv(moved)).to(first.viewmat)
+    return [replace(first, viewmat=viewmat) for viewmat in path_viewmats]
 
 
 def _change(delta: Tensor) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from clod_adapter.adapter import Adapter, detach
 from clod_adapter.cameras import Scene, View
@@ -91,16 +92,17 @@ def distribution(gaussians: Gaussians) -> dict[str, Any]:
     """Histograms with ``edges`` and ``shares``: ``opacity`` over [0, 1], and ``log10_sigma_d`` if
     there is a dial.
     """
-    columns = {"opacity": (gaussians.opacities, OPACITY_EDGES)}
+    found = {"opacity": _histogram(gaussians.opacities, OPACITY_EDGES)}
     if gaussians.sigma_d is not None:
-        columns["log10_sigma_d"] = gaussians.sigma_d.clamp(min=1e-30).log10(), LOG_SIGMA_EDGES
-    histograms = {}
-    for name, (values, edges) in columns.items():
-        inside = values.detach().cpu().clamp(edges[0], edges[-1])
-        counts, _ = np.histogram(inside, edges)
-        shares = counts / max(len(values), 1)
-        histograms[name] = {"edges": list(edges), "shares": shares.tolist()}
-    return histograms
+        powers = gaussians.sigma_d.clamp(min=1e-30).log10()
+        found["log10_sigma_d"] = _histogram(powers, LOG_SIGMA_EDGES)
+    return found
+
+
+def _histogram(values: Tensor, edges: Sequence[float]) -> dict[str, list[float]]:
+    inside = values.detach().cpu().clamp(edges[0], edges[-1])
+    counts, _ = np.histogram(inside, edges)
+    return {"edges": list(edges), "shares": (counts / len(values)).tolist()}
 
 
 def scene_fingerprint(scene: Scene) -> str:

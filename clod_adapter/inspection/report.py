@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -216,6 +217,6 @@ def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> t
             " output"
         )
     if splat.extra:
-        further = f" and {len(splat.extra) - 6} more" * (len(splat.extra) > 6)
-        lines.append(f"{', '.join(splat.extra[:6])}{further}: not used, copied to outputs")
+        names = textwrap.shorten(", ".join(splat.extra), 80, placeholder=" ...")
+        lines.append(f"{names}: not used, copied to outputs")
     return (*lines, *(change for change in changes if "taken as activated" in change))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
 
 from clod_adapter.calibration import Calibration
-from clod_adapter.config import SH_COUNTS, AttenuationConfig, ScreenFilter
+from clod_adapter.config import AttenuationConfig, ScreenFilter
 from clod_adapter.io.values import GROWTH, SIGMA, Prepared
 from clod_adapter.origin import Origin
 
@@ -88,39 +90,30 @@ def values_of(prepared: Prepared) -> dict[str, Any]:
     least.
     """
     keep = prepared.keep
-    columns = {
-        name: np.ascontiguousarray(array[keep].T)
-        for name, array in prepared.arrays.items()
-        if name != "shN"
-    }
+    columns = {name: array[keep] for name, array in prepared.arrays.items() if name != "shN"}
     means = columns["means"]
     logits = columns["opacity_logits"].astype(np.float64)
+    opacities = expit(logits)
     with np.errstate(over="ignore"):
-        scales = np.sort(np.exp(columns["log_scales"].astype(np.float64)), 0)
-        opacities = 1 / (1 + np.exp(-logits))
-    position = [Spread.of(axis) for axis in means]
+        scales = np.sort(np.exp(columns["log_scales"].astype(np.float64))).T
+    position = [Spread.of(axis) for axis in means.T]
     # In float64, in which the squares of all float32 numbers fit.
-    middle = np.array([[spread.median] for spread in position])
-    distance = np.linalg.norm(means.astype(np.float64) - middle, axis=0)
+    middle = np.array([spread.median for spread in position])
+    distance = np.linalg.norm(means - middle, axis=1)
     diagonal = float(np.linalg.norm([spread.high - spread.low for spread in position]))
-    sorted_means = means[:, np.lexsort(means)]
-    repeated = sorted_means[:, 1:] == sorted_means[:, :-1]
-    harmonics = prepared.arrays["shN"]
-    highest = 0
-    for k in range(harmonics.shape[1]):
-        if harmonics[:, k][keep].any():
-            highest = k + 1
+    used = prepared.arrays["shN"].any((0, 2), where=keep[:, None, None])
+    highest = int(np.max(np.flatnonzero(used) + 1, initial=0))
     return dict(
         total=len(keep),
         count=int(keep.sum()),
         dropped=prepared.dropped,
         position=tuple(map(Spread.moved, position, prepared.origin)),
-        used_sh_degree=next(degree for degree, count in SH_COUNTS.items() if count > highest),
+        used_sh_degree=math.isqrt(highest),
         scale=Spread.of(scales.ravel()),
         opacity=Spread.of(opacities),
         needles=float((scales[2] > NEEDLE * scales[1]).mean()),
         infinite_opacity=int(np.isposinf(logits).sum()),
-        doubles=int(repeated.all(0).sum()),
+        doubles=len(means) - len(np.unique(means, axis=0)),
         far=int((distance > FAR * np.quantile(distance, 0.9)).sum()),
         giant=int((scales[2] > diagonal / 2).sum()) if diagonal > 0 else 0,
         fainter_than_visible=float((opacities < FAINT).mean()),

@@ -178,12 +178,17 @@ def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: flo
 def _line(
     axes: Any, k: int, label: str, points: Sequence[tuple[float, float]], linestyle: str = "-"
 ) -> None:
-    style = {
-        "color": SERIES[k % len(SERIES)],
-        "marker": MARKERS[k % len(MARKERS)],
-        "linestyle": linestyle,
-    }
-    axes.plot(*zip(*points, strict=True), linewidth=1.8, markersize=5.5, label=label, **style)
+    colour = SERIES[k % len(SERIES)]
+    marker = MARKERS[k % len(MARKERS)]
+    axes.plot(
+        *zip(*points, strict=True),
+        color=colour,
+        marker=marker,
+        linestyle=linestyle,
+        linewidth=1.8,
+        markersize=5.5,
+        label=label,
+    )
 
 
 def error(psnr: Any) -> Any:
