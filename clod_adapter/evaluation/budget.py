@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from statistics import fmean
 
 import torch
@@ -153,21 +154,17 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
         raise ClodError(
             "a PSNR drop needs the calibration table that adapting stores with the file"
         )
-    best = calibration.rows[0].psnr
-    last = calibration.rows[-1]
-    # From the largest s, where 1/s ascends: the point from which, down to s = 1, the loss stays
-    # within the drop.
-    nearness = [1 / row.virtual_scale for row in reversed(calibration.rows)]
-    losses = [best - row.psnr for row in reversed(calibration.rows)]
-    found = crossing(nearness, losses, drop)
-    assert found is not None  # s = 1 loses nothing
-    if found > nearness[0]:
-        return DialValue(1 / found)
-    note = (
-        f"only {losses[0]:.2f} dB are lost at s = {last.virtual_scale:g}, the largest dial value"
-        " measured"
-    )
-    return DialValue(last.virtual_scale, note)
+    rows = calibration.rows
+    least = rows[0].psnr - drop
+    for row, following in pairwise(rows):
+        if following.psnr < least:  # PSNR is linear in log s
+            share = (row.psnr - least) / (row.psnr - following.psnr)
+            ratio = following.virtual_scale / row.virtual_scale
+            return DialValue(row.virtual_scale * ratio**share)
+    lost = rows[0].psnr - rows[-1].psnr
+    largest = rows[-1].virtual_scale
+    note = f"only {lost:.2f} dB are lost at s = {largest:g}, the largest dial value measured"
+    return DialValue(largest, note)
 
 
 @torch.no_grad()

@@ -127,19 +127,19 @@ class _Measured(NamedTuple):
     seconds: float
     psnr: float
     ssim: float
-    kept: int
-    in_view: int
+    kept: float
+    in_view: float
 
 
 def _row(virtual_scale: float, measured: Sequence[_Measured], total: int) -> Row:
-    kept = statistics.fmean(view.kept for view in measured)
+    mean = _Measured(*np.mean(measured, axis=0).tolist())
     return Row(
         virtual_scale,
-        psnr=statistics.fmean(view.psnr for view in measured),
-        ssim=statistics.fmean(view.ssim for view in measured),
-        kept=kept,
-        kept_share=kept / max(total, 1),
-        in_view=statistics.fmean(view.in_view for view in measured),
+        psnr=mean.psnr,
+        ssim=mean.ssim,
+        kept=mean.kept,
+        kept_share=mean.kept / max(total, 1),
+        in_view=mean.in_view,
         frame_ms=1e3 * statistics.median(view.seconds for view in measured),
     )
 

@@ -14,7 +14,7 @@ from clod_adapter.config import AttenuationConfig, ScreenFilter
 from clod_adapter.io.values import GROWTH, SIGMA, Prepared
 from clod_adapter.origin import Origin
 
-BULK = (0.01, 0.99)  # quantiles that bound the middle 98 %
+QUANTILES = (0, 0.01, 0.5, 0.99, 1)
 NEEDLE = 10.0  # a Gaussian this many times as long as its second axis
 FAR = 10.0  # times the distance from the median position within which nine tenths lie
 FAINT = 1 / 255  # opacity that rasterizers leave out
@@ -33,10 +33,7 @@ class Spread:
     @classmethod
     def of(cls, values: np.ndarray) -> Spread:
         """Summarize a non-empty array."""
-        with np.errstate(invalid="ignore"):  # between two infinite ones
-            quantiles = np.quantile(values, (BULK[0], 0.5, BULK[1]))
-        low, median, high = map(float, quantiles)
-        return cls(float(values.min()), low, median, high, float(values.max()))
+        return cls(*np.quantile(values, QUANTILES).tolist())
 
     def moved(self, by: float) -> Spread:
         """The spread of the values plus ``by``."""

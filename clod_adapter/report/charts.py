@@ -53,7 +53,7 @@ STYLE: dict[Any, Any] = {
 Draw = Callable[[Any], None]  # of the axes of an empty figure
 SIZE = (7.2, 4.8)  # inches
 MARKERS = "oDs^vPX"
-ROOM = (38, 11)  # points that a label takes
+APART = 1.3  # ratio of dial values that are labelled; closer ones could overlap
 BASE = "base, unadapted"
 
 
@@ -140,7 +140,6 @@ QUANTITIES = {
 def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
     """Draws error against one of QUANTITIES: lines for files with a dial, points for others."""
     key, unit, label = QUANTITIES[quantity]
-    notes = list[tuple[str, tuple[float, float]]]()
     for k, line in enumerate(series):
         rows = [row for row in line.rows if row[key] > 0]  # a log axis has no 0
         if not rows:
@@ -148,19 +147,18 @@ def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
         points = [(row[key] / unit, error(row["psnr"])) for row in rows]
         _line(axes, k, line.label, points, linestyle="-" if line.dial else "none")
         if line.dial:
-            texts = [f"s = {row['virtual_scale']:g}" for row in rows]
-            notes += zip(texts, points, strict=True)
+            _label(axes, [row["virtual_scale"] for row in rows], points)
     _finish(axes, label)
-    # Labels of points, without those that would cover another; the first and the last come first.
-    point = axes.figure.dpi / 72
-    placed = list[Any]()
-    for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
-        x, y = axes.transData.transform(at) / point
-        if all(abs(x - left) > ROOM[0] or abs(y - low) > ROOM[1] for left, low in placed):
-            placed.append((x, y))
-            axes.annotate(
-                text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET
-            )
+
+
+def _label(axes: Any, dials: Sequence[float], points: Sequence[tuple[float, float]]) -> None:
+    """Labels points with their dial values, except those close to the last labelled one."""
+    last = 0.0
+    for s, point in sorted(zip(dials, points, strict=True)):
+        if s >= APART * last:
+            last = s
+            offset = {"xytext": (-5, -11), "textcoords": "offset points", "ha": "right"}
+            axes.annotate(f"s = {s:g}", point, fontsize=8, color=QUIET, **offset)
 
 
 def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> None:
