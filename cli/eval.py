@@ -144,7 +144,6 @@ class Comparisons:
     stop: GracefulStop
     report: Report
     tables: dict[str, list[tuple[str, Row]]] = field(default_factory=dict)
-    popping: list[tuple[str, Popping]] = field(default_factory=list)
 
     def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
         """Measures the base with all its Gaussians, and pruned by two rankings to the counts of
@@ -183,24 +182,19 @@ class Comparisons:
             for s in dials if other.sigma_d is not None else [1.0]:
                 count = mean_kept(other, cameras, s)
                 same = matching_dial(self.model, cameras, count)
-                if abs((kept := mean_kept(self.model, cameras, same)) - count) > CLOSE * count:
-                    more = f"{'at most' if kept < count else 'at least'} {kept:,.0f}"
+                kept = mean_kept(self.model, cameras, same)
+                if abs(kept - count) > CLOSE * count:
                     self.console.note(
-                        f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}"
+                        f"{path} keeps {count:,.0f} Gaussians; the model is compared with"
+                        f" {'at most' if kept < count else 'at least'} {kept:,.0f}"
                     )
                 theirs = self._row(other, s, label)
                 ours = self._row(self.model, same, "model")
                 self.tables.setdefault(MATCHED, []).extend(
                     [(label, theirs), (f"s={same:.4g}", ours)]
                 )
-                self.report["against"].append(
-                    {
-                        "model": path,
-                        "label": label,
-                        "theirs": theirs.as_dict(),
-                        "ours": ours.as_dict(),
-                    }
-                )
+                pair = {"theirs": theirs.as_dict(), "ours": ours.as_dict()}
+                self.report["against"].append({"model": path, "label": label, **pair})
 
     def pop(self, max_sv: float) -> None:
         from clod_adapter.evaluation.popping import dial_popping, path_popping
@@ -211,25 +205,22 @@ class Comparisons:
             )
             return
         test = [view.camera for view in self.scene.test]
-
-        def sweep(moved: str, popping: Callable[..., Popping], place: Any) -> None:
-            with self.console.meter("popping") as meter:
-                result = popping(
-                    self.model, place, max_sv, progress=self.stop.stop_on_signal(meter)
-                )
-            self.popping.append((moved, result))
-            self.report["popping"].append({"moved": moved, **vars(result)})
-
+        sweeps: list[tuple[str, Callable[..., Popping], Any]] = []
         for k in range(min(POPPING_VIEWS, len(test))):
             camera = test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)]
-            sweep(f"dial, {camera.name}", dial_popping, camera)
+            sweeps.append((f"dial, {camera.name}", dial_popping, camera))
         cameras = [*test, *(view.camera for view in self.scene.train)]
         ordered = sorted(cameras, key=lambda camera: camera.name)
         # the middle of the capture
         walk = ordered[max((len(ordered) - PATH_CAMERAS) // 2, 0) :][:PATH_CAMERAS]
         if len(walk) > 1:
             moved = f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}"
-            sweep(moved, path_popping, walk)
+            sweeps.append((moved, path_popping, walk))
+        for moved, popping, place in sweeps:
+            with self.console.meter("popping") as meter:
+                listener = self.stop.stop_on_signal(meter)
+                result = popping(self.model, place, max_sv, progress=listener)
+            self.report["popping"].append({"moved": moved, **vars(result)})
 
     def _row(self, gaussians: Gaussians, virtual_scale: float, label: str) -> Row:
         from .shared.measure import measure
@@ -244,7 +235,8 @@ class Comparisons:
         from .shared.measure import popping_table, table
 
         parts = [f"{title}:\n{table(rows)}" for title, rows in self.tables.items()]
-        parts += [popping_table(self.popping)] if self.popping else []
+        if self.report["popping"]:
+            parts.append(popping_table(self.report["popping"]))
         return "".join(f"\n{part}\n" for part in parts)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from dataclasses import astuple
@@ -15,12 +16,11 @@ from .shared.command import add_input
 from .shared.outputs import Report, size
 
 if TYPE_CHECKING:
-    from clod_adapter import AttenuationConfig, Calibration
+    from clod_adapter import Calibration
     from clod_adapter.inspection.report import Inspection
     from clod_adapter.inspection.statistics import Splat, Spread
 
 WIDTH = 13  # of the labels
-MOST_ROWS = 8  # of a calibration, including the first and last
 MOST_LINES = 6  # under one label
 LONGEST = 100  # characters of a comment
 
@@ -45,37 +45,27 @@ def execute(args: Namespace) -> Report:
 def lines_of(found: Inspection) -> list[str]:
     lines = [f"{found.path} ({size(Path(found.path))})", _line("what", found.what)]
     if found.writer:
-        lines.append(
-            _line(
-                "written by" if found.writer.startswith("clod-adapter") else "looks like",
-                found.writer,
-            )
-        )
+        ours = found.writer.startswith("clod-adapter")
+        lines.append(_line("written by" if ours else "looks like", found.writer))
     lines += splat_lines(found.splat)
-    lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies]) + _block(
-        "excluded", found.left_out
-    )
-    lines += _block("note", [note for note in found.notes if not note.startswith(WARNING)])
-    return lines + _block(
-        "warning", [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
-    )
+    lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies])
+    lines += _block("excluded", found.left_out)
+    warnings = [note for note in found.notes if note.startswith(WARNING)]
+    lines += _block("note", [note for note in found.notes if note not in warnings])
+    return lines + _block("warning", [warning.removeprefix(WARNING) for warning in warnings])
 
 
 def splat_lines(splat: Splat) -> list[str]:
-    count = (
-        f"{splat.count:,}"
-        if splat.count == splat.total
-        else f"{splat.count:,} usable of {splat.total:,}"
-    )
-    used = (
-        f", of which only {splat.used_sh_degree} is used"
-        if splat.used_sh_degree < splat.sh_degree
-        else ""
-    )
-    lines = [_line("Gaussians", count), _line("harmonics", f"degree {splat.sh_degree}{used}")]
+    count = f"{splat.count:,}"
+    if splat.count < splat.total:
+        count += f" usable of {splat.total:,}"
+    degree = f"degree {splat.sh_degree}"
+    if splat.used_sh_degree < splat.sh_degree:
+        degree += f", of which only {splat.used_sh_degree} is used"
+    lines = [_line("Gaussians", count), _line("harmonics", degree)]
     if splat.encoding:
-        names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
-        more = f", not read: {names}" if splat.extra else ""
+        names = textwrap.shorten(", ".join(splat.extra), 80, placeholder=" ...")
+        more = f", not read: {names}" if names else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
     lines += _block("says", [comment[:LONGEST] for comment in splat.comments])
     rows: list[tuple[str, Spread | None]] = [
@@ -89,7 +79,10 @@ def splat_lines(splat: Splat) -> list[str]:
     lines.append(_line("shares", shares))
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
-    lines.append(_line("dial", f"{splat.dial_columns}, {_settings(splat.dial.attenuation)}"))
+    attenuation = splat.dial.attenuation
+    form = "the paper's form" if attenuation.form == "paper" else "distances in world units"
+    settings = f"{splat.dial_columns}, s = 1 to {attenuation.max_sv:g}, {form}"
+    lines.append(_line("dial", settings))
     return lines + calibration_lines(splat.dial.calibration)
 
 
@@ -102,34 +95,22 @@ def spread_table(rows: Sequence[tuple[str, Spread | None]]) -> list[str]:
 
 
 def calibration_lines(calibration: Calibration | None) -> list[str]:
-    """The calibration of the file, with at most MOST_ROWS rows."""
+    """The calibration of the file."""
     if calibration is None:
         return [_line("calibration", "none, so --fps and --psnr-drop cannot be solved from it")]
-    c, rows = calibration, list(calibration.rows)
-    if len(rows) > MOST_ROWS:
-        rows = [rows[round(k * (len(rows) - 1) / (MOST_ROWS - 1))] for k in range(MOST_ROWS)]
-    lines = [
-        _line(
-            "calibration",
-            f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}",
-        )
-    ]
+    c = calibration
+    about = f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}"
+    lines = [_line("calibration", about)]
     lines.append(_line("", f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}"))
     numbers = "{:>6.3g}{:>12,.0f}{:>9.2f}{:>8.3f}{:>10.1f}"
-    return lines + [_line("", numbers.format(*astuple(row))) for row in rows]
-
-
-def _settings(attenuation: AttenuationConfig) -> str:
-    """The settings of a dial in words."""
-    form = "the paper's form" if attenuation.form == "paper" else "distances in world units"
-    return f"s = 1 to {attenuation.max_sv:g}, {form}"
+    return lines + [_line("", numbers.format(*astuple(row))) for row in c.rows]
 
 
 def _block(name: str, says: Sequence[str]) -> list[str]:
     lines = [_line(name if k == 0 else "", line) for k, line in enumerate(says[:MOST_LINES])]
-    return lines + (
-        [_line("", f"and {len(says) - MOST_LINES} more: --json")] if len(says) > MOST_LINES else []
-    )
+    if len(says) > MOST_LINES:
+        lines.append(_line("", f"and {len(says) - MOST_LINES} more: --json"))
+    return lines
 
 
 def _line(name: str, says: str) -> str:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 from clod_adapter import AdaptConfig, ClodError, Stopped
 from clod_adapter._support.text import as_text, package_version
-from clod_adapter.config import CLASSIC
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.progress import GracefulStop, Listener
 from clod_adapter.report.charts import check_matplotlib
@@ -90,14 +89,13 @@ class Cell:
     @property
     def key(self) -> Report:
         """Everything that the result depends on, as JSON."""
-        drawn = self.checkpoint.gaussians.screen_filter
         return {
             "version": package_version(),
             "config": self.config and asdict(self.config),
             "points": list(self.points),
             "checkpoint_sha256": self.checkpoint.fingerprint,
             "scene_sha256": self.scene_sha256,
-            **({"screen_filter": repr(drawn)} if drawn != CLASSIC else {}),
+            "screen_filter": repr(self.checkpoint.gaussians.screen_filter),
         }
 
     def read(self) -> Report | None:
@@ -211,8 +209,11 @@ def execute(args: Namespace) -> Report:
             "outputs": files,
         }
         write_results(report, files, Path(args.images).resolve().name)
-    print_cells(report)
-    print("\n" + "\n".join(map(str, files.values())) + f"\n\n{duration(watch.total())} in all")
+    for path in files.values():
+        print(path)
+    if missing:
+        print(f"\nmissing: {', '.join(missing)}; the same command continues")
+    print(f"\n{duration(watch.total())} in all")
     return report
 
 
@@ -237,20 +238,6 @@ def write_results(report: Report, files: dict[str, Path], scene: str) -> None:
                     {"checkpoint": name, "max_sv": limit or "base", "within_range": inside, **row}
                 )
     write_report(files["json"], report)
-
-
-def print_cells(report: Report) -> None:
-    """One line per cell: its first and last row."""
-    width = max(len("checkpoint"), *(len(cell["checkpoint"]) for cell in report["cells"]))
-    print(f"\n{'checkpoint':<{width}}  range     at the first              at the last")
-    for cell in report["cells"]:
-        name = "base" if cell["max_sv"] is None else f"[1, {cell['max_sv']:g}]"
-        line = f"{cell['checkpoint']:<{width}}  {name:<8}"
-        for row in (cell["rows"][0], cell["rows"][-1]):
-            line += f"  {row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}  "
-        print(line.rstrip())
-    if report["missing"]:
-        print(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
 
 
 DESCRIPTION = """\

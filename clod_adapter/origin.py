@@ -39,7 +39,7 @@ def origin_of(means: np.ndarray) -> Origin:
         return NOWHERE
     # The spread of doubles may be below the precision of the largest.
     unit = 2.0 ** math.ceil(math.log2(max(spread, FINEST * distance)))
-    x, y, z = (float(value) for value in np.round(middle / unit) * unit + 0.0)  # no -0
+    x, y, z = (np.round(middle / unit) * unit + 0.0).tolist()  # no -0
     return x, y, z
 
 

@@ -41,7 +41,6 @@ from ..shared.command import make_config
 from ..shared.console import Console, ProgressDisplay, duration
 from ..shared.measure import Stopwatch, measure
 from ..shared.outputs import AdaptFiles, Report, size
-from ..shared.pages import SNAPSHOT_VIEWS
 from ..shared.process import launched
 from .listeners import Saver
 
@@ -159,12 +158,10 @@ def decide(run: Run, display: ProgressDisplay) -> Plan:
 
 
 def forecast(run: Run, plan: Plan) -> None:
-    """Estimates time and peak memory of the rest of a run in one process, unless it is short, from
-    a few steps.
+    """Estimates time and peak memory of the rest of a run in one process, without the page of
+    ``--report``, from a few steps; not of a short run.
     """
     config = plan.config
-    views = len(run.scene.test)
-    base = run.base
     state = run.saver.state
     steps = config.steps - (state.steps if state else 0)
     if steps < LONG or launched().size > 1:
@@ -178,13 +175,7 @@ def forecast(run: Run, plan: Plan) -> None:
     frame = run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0
     measuring = CHEAPER * dials * (run.base_seconds + 15 * frame)
     peak = peak_bytes()
-    if run.args.report:  # curves of seven states at three dial values, 15 pictures and the charts
-        measuring += (
-            CHEAPER * (21 * run.base_seconds * min(SNAPSHOT_VIEWS / max(views, 1), 1) + 15 * frame)
-            + 5
-        )
-        peak += 7 * _bytes(plan.start.without_bands(0))
-    seconds = training + measuring + _bytes(base.gaussians) / WRITING
+    seconds = training + measuring + _bytes(run.base.gaussians) / WRITING
     memory = f", {size(peak)}" if peak else ""
     run.console.say(f"forecast: {duration(seconds)}{memory} ({steps:,} steps)")
     run.forecast_at = time.perf_counter()

@@ -93,14 +93,10 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> Report:
     if page and (run.cut or stop.requests):
         console.say("interrupted: the page of --report was not written")
     elif page:  # after the report, which it changes
-        path = outputs.ply.with_suffix(".html")
-        with run.watch.time("page"):
-            page.write(path, report, result.gaussians, result.adapted.start_seconds)
-        # beside the total, which the page has too
-        report["seconds"] |= {"page": round(run.watch.seconds["page"], 3)}
-        report["forecast"] = against_forecast(run)
+        html = outputs.ply.with_suffix(".html")
+        page.write(html, report, result.gaussians, result.adapted.start_seconds)
         write_report(outputs.report, report)
-    print_summary(run, result, report["seconds"])
+    print_summary(run, result)
     if "loss" in report:
         console.say(f"\nwarning: {report['loss']}")
     return report
@@ -218,7 +214,7 @@ def judge(run: Run, result: Result) -> tuple[str, bool]:
     return "" if good else f"{line}:\n{advice}", not passed
 
 
-def print_summary(run: Run, result: Result, taken: dict[str, float]) -> None:
+def print_summary(run: Run, result: Result) -> None:
     args, outputs = run.args, run.outputs
     if result.rows:
         marked = [("base", row) for row in result.base_rows] + by_dial(result.rows)
@@ -227,8 +223,7 @@ def print_summary(run: Run, result: Result, taken: dict[str, float]) -> None:
             print(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
     for path in vars(outputs).values():
         print(f"{size(path):>9}  {path}")
-    page = f", and {duration(taken['page'])} for the page" if "page" in taken else ""
-    print(f"\n{duration(taken['total'] if page else run.watch.total())} in all{page}; next:")
+    print(f"\n{duration(run.watch.total())} in all; next:")
     model = shlex.quote(str(outputs.ply))
     images = [] if args.images is None else [f"--images {shlex.quote(args.images)}"]
     print("  clod-adapt view", model, f"--base {shlex.quote(args.ply)}", *images)

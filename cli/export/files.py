@@ -100,11 +100,9 @@ def line_of(output: Report, total: int) -> str:
         return f"{line} Gaussians in {len(levels)} levels, by distance: {shown}"
     if output["virtual_scale"] is None:
         return f"{line} Gaussians"
-    about = (
-        "Gaussians, initial dial value"
-        if output["file"].lower().endswith(PAGE)
-        else f"of {total:,} Gaussians,"
-    )
+    about = f"of {total:,} Gaussians,"
+    if output["file"].lower().endswith(PAGE):
+        about = "Gaussians, initial dial value"
     return f"{line} {about} s = {output['virtual_scale']:.5g}"
 
 
@@ -292,9 +290,8 @@ class Export:
                 about.append("tuned for this dial value")
                 with self.console.meter(Phase.TUNING) as meter:
                     gaussians = tune(gaussians, self.tuning_views, progress=meter)
-        about += (
-            ["rows in the order in which the dial keeps them longest"] if self.args.order else []
-        )
+        if self.args.order:
+            about.append("rows in the order in which the dial keeps them longest")
         return gaussians, tuple(dict.fromkeys(about))
 
     def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:

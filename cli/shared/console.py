@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 LINE_EVERY = 10.0  # seconds between progress lines if stderr is not a terminal
-# most characters of the text beside a bar, so that 80 columns have room for label, time and bar
-TEXT = 36
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
 
@@ -102,8 +100,6 @@ class Meter:
     def update(self, share: float, text: str = "") -> None:
         """Shows the ``share`` that is done, in [0, 1], followed by ``text``."""
         now = time.perf_counter()
-        if len(text) > TEXT:
-            text = f"{text[: TEXT - 3].rstrip()}..."
         if self.bar is not None:
             self.bar.set_postfix_str(text, refresh=False)
             self.bar.update(min(share, 1.0) - self.bar.n)

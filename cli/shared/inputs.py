@@ -131,12 +131,12 @@ def pick_device(name: str, console: Console) -> torch.device:
 
 def no_gpu() -> str | None:
     """Why no GPU backend works, None if one does. The first call may compile gsplat for minutes."""
-    if not torch.cuda.is_available() and torch.version.cuda is None:
-        return (
-            f"torch {torch.__version__} is built without CUDA: install torch from"
-            " https://pytorch.org for your CUDA"
-        )
     if not torch.cuda.is_available():
+        if torch.version.cuda is None:
+            return (
+                f"torch {torch.__version__} is built without CUDA: install torch from"
+                " https://pytorch.org for your CUDA"
+            )
         return (
             "torch finds no NVIDIA GPU; check with nvidia-smi that there is one and that its driver"
             " is new enough"

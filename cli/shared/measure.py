@@ -21,12 +21,12 @@ from clod_adapter.calibration import Viewpoint
 from clod_adapter.evaluation.budget import dial_for_times, frame_times
 from clod_adapter.evaluation.calibrate import with_frame_times
 from clod_adapter.evaluation.evaluate import Row
-from clod_adapter.evaluation.popping import Popping
 from clod_adapter.progress import GracefulStop
 
 from .command import given_budget
 from .console import Console
 from .inputs import prepare_kernels
+from .outputs import Report
 
 
 class Stopwatch:
@@ -74,14 +74,13 @@ fade (0.5), but not that of a jump (1.0):
   steps     mean  largest     at  / mean  halved   pixel  halved"""
 
 
-def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
+def popping_table(sweeps: Sequence[Report]) -> str:
     text = POPPING
-    for moved, p in results:
+    for sweep in sweeps:
         text += (
-            f"\n{moved}\n  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f} "
-            f" {p.ratio:6.1f}"
-        )
-        text += f"  {p.persistence:6.2f}  {p.pixel:6.1f}  {p.pixel_persistence:6.2f}"
+            "\n{moved}\n  {steps:5}  {mean:7.4f}  {largest:7.4f}  {at:5.2f}  {ratio:6.1f}"
+            "  {persistence:6.2f}  {pixel:6.1f}  {pixel_persistence:6.2f}"
+        ).format(**sweep)
     return text
 
 
@@ -174,29 +173,30 @@ def solve_dials(
             f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}",
             *notes,
         )
-    elif name != "keep" and calibration is None:
-        none = "there is no calibration in the header"
-        why = next((note for note in model.notes if "calibration" in note), none)
-        raise ClodError(f"{model.path}: {option}: {why}; adapt it again, or give --sv or --keep")
-    elif name == "fps" and calibration is not None:
-        machine = (
-            f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
-        )
-    elif name == "psnr_drop" and calibration is not None and calibration.against == "checkpoint":
-        console.note(
-            "--psnr-drop uses a calibration made without photographs, against renders of the"
-            " checkpoint"
-        )
+    elif name != "keep":
+        if calibration is None:
+            why = [note for note in model.notes if "calibration" in note]
+            why.append("there is no calibration in the header")
+            raise ClodError(
+                f"{model.path}: {option}: {why[0]}; adapt it again, or give --sv or --keep"
+            )
+        if name == "fps":
+            size = f"{calibration.width}x{calibration.height}"
+            machine = f" (frame times of {calibration.machine} at {size})"
+        elif calibration.against == "checkpoint":
+            console.note(
+                "--psnr-drop uses a calibration made without photographs, against renders of the"
+                " checkpoint"
+            )
     dials = []
     for value in values:
         asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
-        wanted: dict[str, Any] = {name: value, "cameras": cameras, "baked": baked}
+        budget_for: dict[str, Any] = {name: value, "cameras": cameras, "baked": baked}
         try:
-            solved = (
-                dial_for_times(times, value)
-                if times
-                else dial_for(model.gaussians, calibration=calibration, **wanted)
-            )
+            if times:
+                solved = dial_for_times(times, value)
+            else:
+                solved = dial_for(model.gaussians, calibration=calibration, **budget_for)
         except ClodError as error:
             raise ClodError(f"{asked}: {error}{machine}") from error
         dials.append(solved.virtual_scale)

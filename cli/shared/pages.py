@@ -80,17 +80,10 @@ class AdaptPage:
                 self.due = tuple(share for share in self.due if share > now.share)
                 state = whole(now.gaussians())
                 # The largest, if it is not trained; far Gaussians have their own.
-                fixed = (
-                    {"shN": self.base.shN}
-                    if len(state) == len(self.base) and self.config.lr_shN == 0
-                    else {}
-                )
-                changing = {
-                    name: value.clone()
-                    for name, value in state.tensors().items()
-                    if name not in fixed
-                }
-                self.snapshots.append((now.seconds, state.replace(**changing, **fixed)))
+                copied = {name: value.clone() for name, value in state.tensors().items()}
+                if len(state) == len(self.base) and self.config.lr_shN == 0:
+                    copied["shN"] = self.base.shN
+                self.snapshots.append((now.seconds, state.replace(**copied)))
 
     def write(self, path: Path, report: Report, result: Gaussians, start_seconds: float) -> None:
         """The same of a run, whose other files are written: the disk stops the page alone, which a
@@ -131,17 +124,14 @@ def pictures(
     if not views:
         return [], {}
     view = views[len(views) // 2]
+    pixels = view.image.numpy()
     if own:
-        others = {
-            "base": Picture(
-                view.image.numpy(), "base, unadapted", "its own rendering, the reference"
-            )
-        }
+        detail = "its own rendering, the reference"
+        others = {"base": Picture(pixels, "base, unadapted", detail)}
     else:
-        others = {"photograph": Picture(view.image.numpy(), "photograph", "held out from training")}
-        others |= (
-            {"base": _rendered(base, view, 1.0, "base, unadapted")} if base is not None else {}
-        )
+        others = {"photograph": Picture(pixels, "photograph", "held out from training")}
+        if base is not None:
+            others["base"] = _rendered(base, view, 1.0, "base, unadapted")
     widest = model.attenuation.max_sv if model.attenuation else 1.0
     dials = dict.fromkeys(float(f"{widest ** (k / (FRAMES - 1)):.2g}") for k in range(FRAMES))
     title = "s = {:g}" if model.sigma_d is not None else "the file"

@@ -159,9 +159,10 @@ def _climb(
     best = score(frame)
     trials = 0
     while step >= smallest and trials < MOST_TRIALS:
-        moves = step * unit * torch.eye(3, dtype=focus.dtype).repeat_interleave(2, 0)
-        moves[1::2] *= -1
-        neighbours = [_placed(frame.scale, frame.offset + move) for move in moves]
+        moves = step * unit * torch.eye(3, dtype=focus.dtype)
+        neighbours = []
+        for move in (*moves, *-moves):
+            neighbours.append(_placed(frame.scale, frame.offset + move))
         for factor in (1 + step, 1 / (1 + step)):
             offset = focus - factor * (focus - frame.offset)
             neighbours.append(_placed(frame.scale * factor, offset))

@@ -76,6 +76,7 @@ def merging(base: Gaussians, scene: Scene) -> Callable[[int], Gaussians]:
     return partial(merge, base, importance(base, spread(scene.train, MOST_VIEWS), AdaptConfig()))
 
 
+@torch.no_grad()
 def compared(
     base: Gaussians, model: Gaussians, view: View, merged_to: Callable[[int], Gaussians]
 ) -> list[Picture]:
@@ -93,8 +94,7 @@ def compared(
     for title, gaussians, s in shown:
         (row,) = evaluate(gaussians, [view] * FRAMES, s)
         detail = f"{row.kept:,.0f} Gaussians, {row.psnr:.1f} dB\n{row.frame_ms:.1f} ms a frame"
-        with torch.no_grad():
-            pixels = render(gaussians, view.camera, s).pixels
+        pixels = render(gaussians, view.camera, s).pixels
         panels.append(Picture(pixels.numpy(), title, detail))
     return panels
 

@@ -40,15 +40,12 @@ def with_frame_times(
         jobs.append((model, [row.virtual_scale for row in rows]))
     times = time_frames(jobs, [view.camera for view in views], progress)
     timed = []
-    for (_, rows), milliseconds, ranges in zip(
-        measured, times.milliseconds, times.ranges, strict=True
-    ):
-        timed.append(list(map(_with_time, rows, milliseconds, ranges)))
+    for (_, rows), *columns in zip(measured, times.milliseconds, times.ranges, strict=True):
+        of_model = []
+        for row, milliseconds, between in zip(rows, *columns, strict=True):
+            of_model.append(replace(row, frame_ms=milliseconds, frame_ms_range=between))
+        timed.append(of_model)
     return timed, times.notes
-
-
-def _with_time(row: Row, frame_ms: float, frame_ms_range: float) -> Row:
-    return replace(row, frame_ms=frame_ms, frame_ms_range=frame_ms_range)
 
 
 def calibrate(

@@ -25,6 +25,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -82,7 +83,7 @@ def sweep(
     wide_changes, wide_pixels = zip(*twice, strict=True)
     largest = max(changes)
     pixel = max(pixels)
-    mean = math.fsum(changes) / len(changes)
+    mean = fmean(changes)
     return Popping(
         steps=len(changes),
         mean=mean,

@@ -240,12 +240,10 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
 
 
 def save_figure(figure: Any, path: str | Path) -> None:
-    # Text in a PNG by which a later run recognizes its own output.
-    about = None
-    if Path(path).suffix.lower() == ".png":
-        about = {"Software": f"clod-adapter {package_version()}"}
+    """Writes a PNG, with text by which a later run recognizes its own output."""
+    about = {"Software": f"clod-adapter {package_version()}"}
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, facecolor=PAPER, metadata=about)
+        figure.savefig(temporary, format="png", facecolor=PAPER, metadata=about)
 
 
 def label_log(axis: Any, text: str = "{:,.0f}", subs: Sequence[float] = (1, 2, 5)) -> None:

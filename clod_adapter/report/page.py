@@ -86,7 +86,6 @@ def write_page(
         others=others,
         strip=[*others.values(), *frames[:: max(len(frames) // 3, 1)]],
         training=training,
-        settings=_settings(report),
         charts={name: partial(charts.inline_svg, draw, name) for name, draw in draws.items()},
         data=script_json({"report": report, "training": training}),
         style=(source / "style.css").read_text("utf-8"),
@@ -124,18 +123,3 @@ def _tiles(series: Sequence[charts.Series]) -> list[tuple[str, Mapping[str, Any]
         for k in sorted({0, len(rows) // 2, len(rows) - 1}):
             tiles.append((f"s = {rows[k]['virtual_scale']:g}", rows[k]))
     return tiles
-
-
-def _settings(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Model, scene, machine and times, by name."""
-    against_base = from_checkpoint(report)
-    settings = {
-        "model": report["model"],
-        "scene": "none (synthetic views)" if against_base else report["scene"],
-        "version": report["version"],
-        **report["machine"],
-        "device": report["device"],
-    }
-    for name, value in report["seconds"].items():
-        settings[f"{name}, seconds"] = f"{value:.1f}"
-    return settings
