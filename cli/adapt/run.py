@@ -93,8 +93,8 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> Report:
     if page and (run.cut or stop.requests):
         console.say("interrupted: the page of --report was not written")
     elif page:  # after the report, which it changes
-        html = outputs.ply.with_suffix(".html")
-        page.write(html, report, result.gaussians, result.adapted.start_seconds)
+        path = outputs.ply.with_suffix(".html")
+        page.write(path, report, result.gaussians, result.adapted.start_seconds)
         write_report(outputs.report, report)
     print_summary(run, result)
     if "loss" in report:
