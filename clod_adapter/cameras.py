@@ -232,7 +232,10 @@ class Scene:
     folder: Path | None = None
 
     def __repr__(self) -> str:
-        return f"Scene({len(self.train)} training views, {len(self.test)} held out)"
+        views = [*self.train, *self.test]
+        sizes = {f"{view.camera.width}x{view.camera.height}" for view in views}
+        size = sizes.pop() if len(sizes) == 1 else f"{len(sizes)} sizes"
+        return f"Scene({len(self.train)} training views, {len(self.test)} held out, {size})"
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

@@ -27,11 +27,7 @@ WORDS = {
 
 
 def align(
-    checkpoint: Checkpoint,
-    scene: Scene,
-    note: Note,
-    *,
-    required: bool,
+    checkpoint: Checkpoint, scene: Scene, note: Note, *, required: bool
 ) -> tuple[Scene, dict[str, Any]]:
     """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements
     for the report.

@@ -105,8 +105,7 @@ def dial_for(
 
 
 def _check_sources(gaussians: Gaussians, cameras: Sequence[Place]) -> None:
-    found = type(gaussians).__name__
-    require(isinstance(gaussians, Gaussians), "gaussians", f"a {found}", "of type Gaussians")
+    require(isinstance(gaussians, Gaussians), "gaussians", type(gaussians), "Gaussians")
     places = isinstance(cameras, Sequence) and all(isinstance(each, Place) for each in cameras)
     if cameras and not places:
         raise ClodError(

@@ -111,9 +111,9 @@ def test_progress_lines_without_a_terminal(capsys, monkeypatch):
     monkeypatch.setattr("clod_adapter.cli.shared.console.time", clock)
     meter = Meter(Console(), "training")
     for now in range(1, 21):
-        meter.update(now / 90, f"step {now} of a checkpoint of a very long name")
+        meter.update(now / 90, f"step {now}")
     assert capsys.readouterr().err.splitlines() == [
-        f"training  {share}%, {left} left, step {step} of a checkpoint of a very..."
+        f"training  {share}%, {left} left, step {step}"
         for share, left, step in ((11, "1:20", 10), (22, "1:10", 20))
     ]
     now = 10.0  # the time left does not count the work of an earlier run
