@@ -141,7 +141,7 @@ class _Tuning:
         gradients = dict[str, Tensor]()
         for (name, value), gradient in zip(self.tuned.items(), found, strict=True):
             gradients[name] = torch.zeros_like(value).index_copy(0, moved, gradient[: len(moved)])
-        finite = nonfinite_rows(gradients).logical_not()
+        finite = ~nonfinite_rows(*gradients.values())
         rates = {name: LAST_RATE**share_done * self.rates[name] for name in self.tuned}
         self.optimizer.step(gradients, drawn[: self.trained] & finite, rates)
         if share_done >= 1 - AVERAGED:
