@@ -119,7 +119,7 @@ class Adapter:
             ClodError: a different base was given.
         """
         if fingerprint is not None and fingerprint != self.base_fingerprint:
-            raise _other_base(f"SHA-256 {fingerprint}", self.base_fingerprint)
+            raise _other_base(f"SHA-256 {fingerprint[:12]}", self.base_fingerprint[:12])
         if len(base) != self.base_count:
             raise _other_base(f"{len(base)} Gaussians", self.base_count)
         plain = base.replace(sigma_d=None, growth_d=None, attenuation=None)

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, replace
-from itertools import chain, pairwise
+from dataclasses import astuple, dataclass, fields, replace
 from typing import Any
 
 from clod_adapter.config import FARTHEST, require
@@ -17,7 +16,6 @@ AGAINST = ("photographs", "checkpoint")
 # Every file has room for so many.
 MOST_ENTRIES = 1000  # rows and viewpoints
 LONGEST_MACHINE = 1000  # characters of the machine's name
-NARROWEST = 1e-4  # angle of view, radians
 LARGEST = 1 << 32  # count
 PIXELS = 1 << 26  # of an image: a page renders images of this size
 
@@ -64,20 +62,17 @@ class Viewpoint:
 
     def __post_init__(self) -> None:
         values = astuple(self)
-        near = all(abs(value) < FARTHEST for value in values[:3])
-        require(near, "the centre of a viewpoint", values[:3], f"below {FARTHEST:g}")
-        lengths = math.hypot(*values[4:7]), math.hypot(*values[7:10])
-        units = max(abs(length - 1) for length in lengths) < 1e-3
-        has_direction = units and NARROWEST < self.fov < math.pi
-        require(
-            has_direction or not any(values[4:]),
-            "the direction of a viewpoint",
-            values[4:],
-            "unit vectors and an angle",
-        )
-        require(
-            0 < self.unit < math.inf, "the unit of a viewpoint", self.unit, "positive and finite"
-        )
+        centre = values[:3]
+        direction = values[4:]
+        near = max(map(abs, centre)) < FARTHEST and not math.isnan(sum(centre))
+        require(near, "the centre of a viewpoint", centre, f"below {FARTHEST:g}")
+        look = math.hypot(*direction[:3])
+        up = math.hypot(*direction[3:6])
+        units = abs(look - 1) < 1e-3 and abs(up - 1) < 1e-3
+        sound = not any(direction) or (units and 1e-4 < self.fov < math.pi)
+        require(sound, "the direction of a viewpoint", direction, "unit vectors and an angle")
+        sound = 0 < self.unit < math.inf
+        require(sound, "the unit of a viewpoint", self.unit, "positive and finite")
 
     def moved(self, by: Sequence[float]) -> Viewpoint:
         """A copy with its centre moved by ``by [3]``, world units."""
@@ -116,37 +111,23 @@ class Calibration:
     def __post_init__(self) -> None:
         object.__setattr__(self, "viewpoints", tuple(self.viewpoints))
         dials = [row.virtual_scale for row in self.rows]
-        if dials[:1] != [1] or any(b <= a for a, b in pairwise(dials)):
+        if dials[:1] != [1] or dials != sorted(set(dials)):
             raise ClodError(f"calibration has dial values {dials}, they must ascend from 1")
-        if not all(map(math.isfinite, chain.from_iterable(map(astuple, self.rows)))):
-            raise ClodError("calibration has a value that is not finite")
-        counts = self.total, self.views, self.width, self.height
-        if min(counts) < 1 or min(row.frame_ms for row in self.rows) <= 0:
-            raise ClodError("calibration has a count, size or frame time that is not positive")
-        require(
-            max(counts) <= LARGEST,
-            "a count or size of a calibration",
-            max(counts),
-            f"at most {LARGEST}",
-        )
-        size = f"{self.width}x{self.height}"
-        require(
-            self.width * self.height <= PIXELS,
-            "the image of a calibration",
-            size,
-            f"at most {PIXELS} pixels",
-        )
+        for row in self.rows:
+            if not all(map(math.isfinite, astuple(row))) or row.frame_ms <= 0:
+                raise ClodError(f"calibration has a value out of range: {row}")
+        counts = (self.total, self.views, self.width, self.height)
         entries = len(self.rows) + len(self.viewpoints)
-        limit = f"at most {MOST_ENTRIES}"
-        require(entries <= MOST_ENTRIES, "the number of rows and viewpoints", entries, limit)
-        plain = self.machine.isascii() and self.machine == _plain(self.machine) != ""
-        require(
-            plain, "the machine of a calibration", repr(self.machine), "one line of printable ASCII"
-        )
-        if self.against not in AGAINST:
+        sound = min(counts) >= 1 and max(counts) <= LARGEST
+        if not sound or self.width * self.height > PIXELS or entries > MOST_ENTRIES:
+            raise ClodError(f"calibration has a count or size out of range: {(*counts, entries)}")
+        if not self.machine.isascii() or self.machine != _plain(self.machine) or not self.machine:
             raise ClodError(
-                f"calibration is against {self.against!r}, it must be one of {', '.join(AGAINST)}"
+                f"the machine of a calibration is {self.machine!r}, it must be one line of"
+                " printable ASCII"
             )
+        known = ", ".join(AGAINST)
+        require(self.against in AGAINST, "against", repr(self.against), f"one of {known}")
 
     @classmethod
     def of(
@@ -159,12 +140,11 @@ class Calibration:
         """
         by_dial = {}
         for row in sorted(rows, key=lambda row: row.virtual_scale):
-            values = row.virtual_scale, row.kept, row.psnr, row.ssim, row.frame_ms
-            by_dial[float(row.virtual_scale)] = CalibrationRow(*map(float, values))
+            values = {each.name: float(getattr(row, each.name)) for each in fields(CalibrationRow)}
+            by_dial[row.virtual_scale] = CalibrationRow(**values)
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
         width, height = size
-        rows = tuple(by_dial.values())
-        return cls(rows, width=width, height=height, machine=name, **others)
+        return cls(tuple(by_dial.values()), width=width, height=height, machine=name, **others)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Calibration:

@@ -125,9 +125,9 @@ PLACE = Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8)
             (Calibration(**GOOD), {"rows": rows}, "ascend from 1")
             for rows in ((), (replace(ROW, virtual_scale=2.0),), (ROW, ROW))
         ),
-        (Calibration(**GOOD), {"rows": (replace(ROW, psnr=float("inf")),)}, "not finite"),
-        (Calibration(**GOOD), {"rows": (replace(ROW, frame_ms=0.0),)}, "not positive"),
-        (Calibration(**GOOD), {"total": 0}, "not positive"),
+        (Calibration(**GOOD), {"rows": (replace(ROW, psnr=float("inf")),)}, "out of range"),
+        (Calibration(**GOOD), {"rows": (replace(ROW, frame_ms=0.0),)}, "out of range"),
+        (Calibration(**GOOD), {"total": 0}, "out of range"),
         (
             Calibration(**GOOD),
             {"against": "thin air"},

@@ -99,7 +99,8 @@ def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Vi
     look = camera.viewmat[2, :3].tolist()
     up = (-camera.viewmat[1, :3]).tolist()
     fov = 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
-    return Viewpoint(*position.tolist(), unit, *look, *up, fov=fov)
+    values = [*position.tolist(), unit, *look, *up, fov]
+    return Viewpoint(*values)
 
 
 def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> Camera:

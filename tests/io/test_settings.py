@@ -84,7 +84,7 @@ def test_every_format_uses_the_reader(tmp_path, kind):
     total = "calibrated_with" if ply else "total"
     *settings, (note,) = changed(total, "40", "-4")
     assert settings == [ATTENUATION, CLASSIC, None]
-    assert re.search("unusable and ignored.*not positive", note)
+    assert re.search("unusable and ignored.*out of range", note)
     if not adapter:
         *settings, (note,) = changed(total, "40", "41")
         assert settings[2] is None

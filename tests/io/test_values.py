@@ -138,7 +138,7 @@ def test_own_outputs_need_no_option(tmp_path):
     out = load(tmp_path / "out.ply")
     assert_close(out.gaussians.opacity_logits, g.opacity_logits.abs(), atol=2e-2, rtol=1e-3)
     assert out.comments[:2] == base.notes
-    with refused("different base.*trained on both:"):
+    with refused("different base.*the adapter both:"):
         adapter.apply(g, load(path, activated="none").fingerprint)
 
 
