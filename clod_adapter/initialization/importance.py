@@ -16,7 +16,7 @@ from clod_adapter.equation.distances import median_distance, typical_distance
 from clod_adapter.equation.units import in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians, largest_colour, nonfinite_rows
-from clod_adapter.initialization.pruning_order import PruningOrder, initial_growth, pruning_order
+from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
@@ -41,27 +41,22 @@ def initialize(
     A dial that ``base`` already has, with any effect, is kept with its own settings except the
     config's ``max_sv``.
     """
+    views = spread(views, MOST_VIEWS)
     if base.attenuation is not None and has_dial(base):
         if base.attenuation.form != config.form:
             raise ClodError(
                 f"the dial has the form {base.attenuation.form}; adapt with the same, or give a"
                 " plain file"
             )
-        distance = known_distance(base.attenuation) or scene_distance(
-            base, spread(views, MOST_VIEWS)
-        )
+        distance = known_distance(base.attenuation) or scene_distance(base, views)
         settings = replace(base.attenuation, max_sv=config.max_sv, reference_distance=distance)
-        return in_world_units(
-            with_growth(base.replace(attenuation=settings), config, base.growth_d)
-        )
-    views = spread(views, MOST_VIEWS)
+        kept = base.replace(attenuation=settings)
+        return in_world_units(with_growth(kept, config, base.growth_d))
     attenuation = config.attenuation(scene_distance(base, views))
-    pruned = pruning_order(base, importance(base, views, config, progress), progress)
+    order = pruning_order(base, importance(base, views, config, progress), progress)
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
-    initial = base.replace(sigma_d=reach_of(pruned, distances, config), attenuation=attenuation)
-    # Training that begins with this growth ends 0.1 to 0.2 dB lower than from 0 (docs/method.md).
-    fitted = initial_growth(initial, pruned.substitute, distances) if config.iters == 0 else None
-    return in_world_units(with_growth(initial, config, fitted))
+    initial = base.replace(sigma_d=reach_of(order, distances, config), attenuation=attenuation)
+    return in_world_units(with_growth(initial, config))
 
 
 def importance(
@@ -74,12 +69,12 @@ def importance(
 
 
 def reach_of(
-    pruned: PruningOrder, distances: Tensor, config: AdaptConfig, total: int | None = None
+    order: Tensor, distances: Tensor, config: AdaptConfig, total: int | None = None
 ) -> Tensor:
-    """``[N]`` sigma_d, in the unit of the typical ``distances [N]``; ``total`` as for
-    ``extinction_from_rank``.
+    """``[N]`` sigma_d from the pruning order, in the unit of the typical ``distances [N]``;
+    ``total`` as for ``extinction_from_rank``.
     """
-    scales = extinction_from_rank(pruned.position.max() - pruned.position, config, total)
+    scales = extinction_from_rank(order.max() - order, config, total)
     return distances * scales.clamp(max=WIDEST * config.max_sv)
 
 
@@ -88,10 +83,10 @@ def with_growth(
 ) -> Gaussians:
     """``initial`` with ``growth_d``, by default 0; without one if the config has no growth."""
     if config.growth == "off":
-        return initial.replace(growth_d=None)
-    return initial.replace(
-        growth_d=torch.zeros_like(initial.opacity_logits) if growth_d is None else growth_d
-    )
+        growth_d = None
+    elif growth_d is None:
+        growth_d = torch.zeros_like(initial.opacity_logits)
+    return initial.replace(growth_d=growth_d)
 
 
 def for_training(initial: Gaussians) -> Gaussians:
@@ -100,10 +95,8 @@ def for_training(initial: Gaussians) -> Gaussians:
     """
     assert initial.attenuation is not None
     distance = known_distance(initial.attenuation) or 1.0
-    return with_distance(
-        initial.replace(attenuation=replace(initial.attenuation, reference_distance=distance)),
-        distance,
-    )
+    attenuation = replace(initial.attenuation, reference_distance=distance)
+    return with_distance(initial.replace(attenuation=attenuation), distance)
 
 
 def has_dial(base: Gaussians) -> bool:
@@ -116,17 +109,18 @@ def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
     """The views with at least one Gaussian's centre beyond their near plane; the others render
     nothing.
     """
-    usable = []
-    for view in views:
-        if bool((view.camera.depths(base.means) >= view.camera.near).any()):
-            usable.append(view)
+
+    def sees(camera: Camera) -> bool:
+        return bool((camera.depths(base.means) >= camera.near).any())
+
+    usable = tuple(view for view in views if sees(view.camera))
     if not usable:
         raise ClodError(
             f"no Gaussian is in front of any of the {len(views)} training cameras: checkpoint and"
             " cameras are not of one scene, or not in one coordinate frame; give the photographs"
             " and poses it was trained on"
         )
-    return tuple(usable)
+    return usable
 
 
 def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
@@ -137,7 +131,8 @@ def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     (docs/method.md, "Near to far").
     """
     medians = sorted(median_distance(base.means, view.camera) for view in views)
-    return medians[max(math.ceil(NEAREST_VIEWS * len(medians)), 2 if len(medians) > 2 else 1) - 1]
+    second = 1 if len(medians) > 2 else 0
+    return medians[max(math.ceil(NEAREST_VIEWS * len(medians)) - 1, second)]
 
 
 def removal_error(
@@ -156,12 +151,10 @@ def removal_error(
     smaller = gaussians.replace(screen_filter=gaussians.screen_filter.halved())
     for done, view in enumerate(views, 1):
         opacities = gaussians.opacities.detach().requires_grad_()
-        small = view.camera.halvable
-        image, _ = splat(
-            smaller if small else gaussians,
-            opacities,
-            view.camera.halved() if small else view.camera,
-        )
+        if view.camera.halvable:
+            image, _ = splat(smaller, opacities, view.camera.halved())
+        else:
+            image, _ = splat(gaussians, opacities, view.camera)
         bits = torch.randint(0, 2, image.shape, generator=generator, dtype=torch.uint8)
         signs = bits.to(image.device).to(image) * 2 - 1
         # as grad_outputs they would import sympy
@@ -188,9 +181,9 @@ def extinction_from_rank(rank: Tensor, config: AdaptConfig, total: int | None = 
     share = (rank.double() + 0.5) / (total or len(rank))
     discriminant = share**-2 - 4 * (1 / config.start_share - 1)
     power = (1 / share + discriminant.clamp(min=0).sqrt()) / 2
-    return torch.where(
-        share <= config.start_share, power ** (1 / config.exponent), config.start_share / share
-    ).float()
+    above = power ** (1 / config.exponent)
+    below = config.start_share / share
+    return torch.where(share <= config.start_share, above, below).float()
 
 
 def coverage(

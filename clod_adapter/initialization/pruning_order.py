@@ -1,15 +1,10 @@
-"""The pruning order, in which a similar neighbour remains for each Gaussian that is removed, and
-growth to cover it.
-"""
-
-from typing import NamedTuple
+"""The pruning order, in which a similar neighbour remains for each Gaussian that is removed."""
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from clod_adapter._support.arrays import float64_array
-from clod_adapter.equation.attenuation import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.neighbours import nearest, without_crowds
@@ -22,27 +17,13 @@ APART = 0.05  # weight of the distance, relative to a squared difference of colo
 DIFFERENT = 1e12  # dissimilarity for colours or sizes that are not finite
 # of the remaining: if a round removes fewer, it removes the cheapest REMOVED without conditions
 STUCK = 0.02
-DIALS = 24  # dial values of the fit of growth, evenly spaced in log s
-LARGEST_EXPONENT = 1.0  # of the fit, before SHARE
-SHARE = 0.65  # of the fitted exponents that is used; 0.5 and 0.8 are no better at any share
-
-
-class PruningOrder(NamedTuple):
-    """The number of Gaussians removed before each, and the similar one, removed later, that took
-    its importance.
-
-    Both are ``[N]`` int64. The last one's substitute is itself.
-    """
-
-    position: Tensor
-    substitute: Tensor
 
 
 def pruning_order(
     gaussians: Gaussians, importance: Tensor, progress: Listener | None = None
-) -> PruningOrder:
-    """Half-edge collapse, as for the levels of a mesh: which Gaussians can be removed first, and in
-    whose favour.
+) -> Tensor:
+    """``[N]`` int64, the number of Gaussians removed before each: half-edge collapse, as for the
+    levels of a mesh.
 
     In rounds. Removing Gaussian i costs the minimum over its NEIGHBOURS nearest centres j of
     ``w_i (|c_i - c_j|^2 + COLOUR_FLOOR^2 + APART r^2 / (r^2 + (l_i + l_j)^2))``, with w the
@@ -61,7 +42,6 @@ def pruning_order(
     weights = float64_array(importance).copy()
     order = np.empty(count, np.int64)
     centres = without_crowds(float64_array(gaussians.means), sizes)
-    favoured = np.arange(count)
     remaining = np.arange(count)
     removed_count = 0
     while len(remaining) > 1:
@@ -71,14 +51,12 @@ def pruning_order(
         removed = _removed(weights[remaining] * difference, substitute)
         np.add.at(weights, remaining[substitute[removed]], weights[remaining[removed]])
         order[remaining[removed]] = removed_count + np.arange(len(removed))
-        favoured[remaining[removed]] = remaining[substitute[removed]]
         removed_count += len(removed)
         remaining = np.delete(remaining, removed)
         tell(progress, Phase.PRUNING_ORDER, removed_count, count)
     order[remaining] = removed_count
     tell(progress, Phase.PRUNING_ORDER, count, count)
-    device = importance.device
-    return PruningOrder(torch.from_numpy(order).to(device), torch.from_numpy(favoured).to(device))
+    return torch.from_numpy(order).to(importance.device)
 
 
 def _removed(cost: np.ndarray, substitute: np.ndarray) -> np.ndarray:
@@ -131,47 +109,3 @@ def _most_similar(
             better = (dissimilarity < least) & (neighbour != rows)
             substitute[better], least[better] = neighbour[better], dissimilarity[better]
     return substitute, least
-
-
-@torch.no_grad()
-def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor) -> Tensor:
-    """``[N]`` the exponents h, in [0, LARGEST_EXPONENT SHARE], from the pruning order; no
-    photograph is needed.
-
-    At a dial value s a Gaussian stands for itself and for all that were removed before s in whose
-    favour it, or their substitute, was kept. Areas A are opacity times the product of the two
-    larger scales, as merging tools weigh them. h is the least-squares fit of
-    ``h log m(s) = log(sum of A / own A) / 2`` over the dial values at which it is kept, times
-    SHARE.
-    """
-    config = gaussians.attenuation
-    assert config is not None and gaussians.sigma_d is not None
-    scales = gaussians.log_scales.double().sort(1).values
-    area = gaussians.opacities.double() * (scales[:, 1] + scales[:, 2]).exp()
-    extinction = gaussians.sigma_d / distances
-    unit_growth = torch.ones_like(distances)
-    start = growth_distance(config)
-    total = torch.zeros_like(area)
-    weight = torch.zeros_like(area)
-    for k in range(1, DIALS):
-        s = config.max_sv ** (k / (DIALS - 1))
-        kept = extinction > s
-        receivers = _kept_substitutes(kept, substitutes)
-        covered_area = torch.zeros_like(area).index_add_(0, receivers, area)
-        needed = (covered_area / area).clamp(min=1).log().div_(2).nan_to_num_(0.0, 0.0)
-        available = growth_factors(unit_growth, distances, s, start).double().log()
-        total += kept * needed * available
-        weight += kept * available.square()
-    exponents = (total / weight.clamp(min=1e-12)).clamp_(0, LARGEST_EXPONENT)
-    return exponents.mul_(SHARE).to(gaussians.opacity_logits)
-
-
-def _kept_substitutes(kept: Tensor, substitutes: Tensor) -> Tensor:
-    """``[N]`` the first kept one of each Gaussian, its substitute, the substitute of that and so
-    on.
-    """
-    rows = torch.arange(len(kept), device=kept.device)
-    substitute = torch.where(kept, rows, substitutes)
-    for _ in range(len(kept).bit_length()):  # each time chains are twice as long
-        substitute = substitute[substitute]
-    return substitute

@@ -89,11 +89,10 @@ def with_far(
         error = supposed_error(base, error)
     weights = (error.sqrt() * base.opacities).double() ** contrast
     far = merge(base, weights, max(round(share * len(base)), 1), progress)
-    pruned = pruning_order(far, importance(far, views, config, progress), progress)
+    order = pruning_order(far, importance(far, views, config, progress), progress)
     distances = typical_distance(far.means, cameras, attenuation)
-    reach = reach_of(pruned, distances, replace(config, start_share=1.0), len(base)).clamp(
-        min=LONGER * near
-    )
+    reach = reach_of(order, distances, replace(config, start_share=1.0), len(base))
+    reach = reach.clamp(min=LONGER * near)
     attenuation = replace(attenuation, near_distance=near * attenuation.scene_distance)
     far = with_growth(far.replace(sigma_d=reach, attenuation=attenuation), config)
     return in_world_units(with_near(base, far))

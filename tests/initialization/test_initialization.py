@@ -17,10 +17,8 @@ from clod_adapter.initialization.importance import initialize, removal_error, us
 from clod_adapter.initialization.pruning_order import (
     APART,
     COLOUR_FLOOR,
-    LARGEST_EXPONENT,
     NEIGHBOURS,
     REMOVED,
-    SHARE,
 )
 from clod_adapter.render import splat
 from runs import counted
@@ -107,7 +105,7 @@ def test_initialization_culls_in_the_pruning_order():
 
     error = removal_error(model, views, seed=0)
     found = (model.sigma_d / distances_of(model, views)).argsort()
-    order = pruning.pruning_order(model, error.sqrt() * model.opacities).position
+    order = pruning.pruning_order(model, error.sqrt() * model.opacities)
     assert torch.equal(found[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 
@@ -155,7 +153,7 @@ def test_order_matches_the_plain_implementation(n, seed):
     model = gaussians(n, 1, seed)
     steps = []
     worth = torch.rand(n, generator=seeded(seed))
-    order = pruning.pruning_order(model, worth, counted(steps)).position
+    order = pruning.pruning_order(model, worth, counted(steps))
     assert order.argsort().tolist() == plainly(model, worth)
     assert n < 60 or (steps == sorted(steps) and 0 < steps[0][0] < 30 and steps[-1] == (60, 60))
 
@@ -167,17 +165,8 @@ def test_coincident_gaussians_are_moved_apart():
     # Of no worth and no size at all: ties, and nothing to divide by.
     for one in (alike, alike.replace(log_scales=torch.full((2000, 3), -400.0))):
         steps = []
-        order = pruning.pruning_order(one, torch.zeros(2000), counted(steps)).position
+        order = pruning.pruning_order(one, torch.zeros(2000), counted(steps))
         assert order.sort().values.equal(torch.arange(2000)) and len(steps) < 300
-
-
-def test_growth_begins_with_0_where_it_is_trained():
-    """Else exponents are in their range, and 0 without descendants."""
-    model = gaussians(400, 0, 0)
-    views = photograph(model, ring(2, 16, 12))
-    assert not initialize(model, views, AdaptConfig(iters=1)).growth_d.any()
-    growth = initialize(model, views, AdaptConfig(iters=0)).growth_d
-    assert growth.min() == 0 and 0 < growth.max() <= LARGEST_EXPONENT * SHARE
 
 
 def test_a_dial_of_another_form_is_refused():
