@@ -48,4 +48,3 @@ from .training.pseudo_views import add_pseudo_views as add_pseudo_views
 from .training.pseudo_views import render_pseudo_views as render_pseudo_views
 from .training.state import Adapted as Adapted
 from .training.tuning import tune as tune
-from .training.tuning import tune_levels as tune_levels

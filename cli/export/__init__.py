@@ -66,10 +66,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     output.add_argument("--multiplier", metavar="M", type=float, default=MULTIPLIER, help=text)
     text = "fit the view-dependent colours to this SH degree, 0 to 3: most of a file's bytes"
     output.add_argument("--sh-degree", metavar="N", type=int, choices=range(4), help=text)
-    text = (
-        "fine-tune what is baked for a dial value, or each level for its band, on the photographs"
-        " of --images; of a MODEL adapted without any, on its renders at s = 0"
-    )
+    text = "fine-tune what is baked for a dial value on the photographs of --images"
     output.add_argument("--tune", action="store_true", help=text)
     output.add_argument(
         "--order", choices=["extinction"], help="put first the Gaussians that are culled last"
@@ -119,10 +116,10 @@ def check(args: Namespace) -> None:
             "--camera needs a dial value to bake; give one, as in --sv 2",
         ),
         (
-            args.tune and (page or args.camera is not None or not (bakes or folder)),
+            args.tune and (page or not bakes or args.images is None or args.camera is not None),
             (
-                "--tune is for dial values that are baked for all cameras, and for levels: add"
-                f" --keep N, or one of {' and '.join(FOLDERS)}; remove --camera"
+                "--tune is for dial values that are baked for all cameras: give --images and a dial"
+                " value or budget, without --camera"
             ),
         ),
         (
@@ -131,10 +128,10 @@ def check(args: Namespace) -> None:
         ),
         (
             args.images is not None
-            and not (bakes or args.order or page or args.sh_degree is not None or args.tune),
+            and not (bakes or args.order or page or args.sh_degree is not None),
             (
-                f"--images is used for baking, --tune, --sh-degree, --order and {PAGE} only; add"
-                " one of them, as in --sv 2"
+                f"--images is used for baking, --sh-degree, --order and {PAGE} only; add one of"
+                " them, as in --sv 2"
             ),
         ),
         (

@@ -15,13 +15,10 @@ from clod_adapter import (
     View,
     bake,
     bake_levels,
-    detach,
     order_by_extinction,
     place_cameras,
     render,
-    render_pseudo_views,
     tune,
-    tune_levels,
 )
 from clod_adapter.bake import Level
 from clod_adapter.calibration import Viewpoint
@@ -143,17 +140,10 @@ class Export:
         self.dials: list[float] = dials or []  # which are baked, or the one at which a page opens
 
     def _find_tuning_views(self) -> Sequence[View]:
-        """The photographs of --images; renders at s = 0 of a model that was adapted without any."""
-        model = self.model
-        if self.args.images is None and not model.placed:
-            raise ClodError(
-                f"{model.path}: --tune needs the photographs that it was adapted on; give --images"
-            )
-        inputs.prepare_kernels(self.console, model.gaussians.means.device)
-        if self.args.images is None:
-            return render_pseudo_views(detach(model.gaussians), model.cameras).train
-        scene = inputs.read_scene(self.args.images, self.console, model.origin)
-        return inputs.align_shown(model, scene, self.console, required=False)[0].train
+        """The photographs to train on of --images, in the model's frame."""
+        inputs.prepare_kernels(self.console, self.model.gaussians.means.device)
+        scene = inputs.read_scene(self.args.images, self.console, self.model.origin)
+        return inputs.align_shown(self.model, scene, self.console, required=False)[0].train
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they
@@ -321,9 +311,6 @@ class Export:
     def _write_set(self, index: Path) -> list[Level]:
         """Writes a streaming or 3D Tiles set to the folder of ``index``; its levels."""
         levels = bake_levels(self.gaussians, self.args.multiplier)
-        if self.args.tune:
-            with self.console.meter(Phase.TUNING) as meter:
-                levels = tune_levels(levels, self.tuning_views, progress=meter)
         if self.args.folder == "--3dtiles":
             self.console.note(*write_tileset(index.parent, levels, origin=self.model.origin))
             return levels

@@ -184,9 +184,12 @@ ERRORS = [
     ("export bare.ply -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
     (
         "export bare.ply -o x.ply --images scene",
-        "--images is used for baking, --tune, --sh-degree, --order and .html",
+        "--images is used for baking, --sh-degree, --order and .html",
     ),
-    ("export bare.ply -o x.ply --tune", "--tune is for dial values that are baked for all cameras"),
+    (
+        "export bare.ply -o x.ply --sv 2 --tune",
+        "--tune is for dial values that are baked for all cameras",
+    ),
     (
         "export bare.ply -o x.ply --sv 2 --tune",
         "--tune needs the photographs that it was adapted on",

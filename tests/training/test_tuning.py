@@ -1,12 +1,8 @@
-"""Tuning of plain Gaussians: pictures improve, the finest of several levels stays, errors name the
-remedy.
-"""
+"""Tuning of plain Gaussians: pictures improve, and errors name the remedy."""
 
 import pytest
-import torch
 
-from clod_adapter import ClodError, Phase, Stopped, evaluate, tune, tune_levels
-from clod_adapter.bake import Level
+from clod_adapter import ClodError, Phase, Stopped, evaluate, tune
 from scenes import assert_equal, attenuated, capture
 
 
@@ -29,17 +25,6 @@ def test_pictures_improve(faded):
     assert quality(tuned, views) > quality(start, views) + 3
     assert_equal(start, before)
     assert_equal(tuned, tune(start, views, 60))
-
-
-def test_levels_are_tuned_where_they_are_drawn(faded):
-    start, views = faded
-    distances = torch.cat([(start.means - v.camera.position).norm(dim=1) for v in views])
-    away = float(distances.max()) * 2
-    levels = [Level(0.0, start), Level(float(distances.min()) / 2, start), Level(away, start)]
-    finest, drawn, beyond = tune_levels(levels, views, 90)
-    assert_equal(finest.gaussians, start)
-    assert quality(drawn.gaussians, views) > quality(start, views) + 1
-    assert [level.begins for level in (finest, drawn, beyond)] == [each.begins for each in levels]
 
 
 def test_a_listener_stops_it(faded):
