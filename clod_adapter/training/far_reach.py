@@ -9,6 +9,7 @@ nothing tells which: merged Gaussians are no measure of trained ones.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from statistics import fmean
 
@@ -19,7 +20,7 @@ from clod_adapter.cameras import View, spread
 from clod_adapter.equation.attenuation import dial, kept_between, smallest_dial
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.losses import decibels, mean_squared_error
+from clod_adapter.losses import mean_squared_error
 from clod_adapter.progress import Listener, Phase, Stopped, tell
 from clod_adapter.render import render
 from clod_adapter.training.schedule import FAR
@@ -29,7 +30,7 @@ MEASURED_VIEWS = 24  # few are all easy, or all hard: at 8 % views differ by 10 
 STEP = 1.15  # factor between the reaches that are tried
 MOST_STEPS = 8
 FARTHEST = 1e3  # dial value at which the search for one ends
-EXACT = 100.0  # dB, above which pictures are equal
+EXACT = 1e-10  # squared error below which pictures are equal
 LOSS = 0.1  # dB that one budget may lose for the others
 PRECISION = 1e-3  # of the dial value that meets a budget
 
@@ -45,49 +46,48 @@ def fit_far_reach(
     counted in training do not matter.
     Where ``progress`` returns False, the best one so far is the result.
     """
-    assert gaussians.attenuation is not None
-    views = spread(views, MEASURED_VIEWS)
-    images = [view.image for view in views]
-    distances = [
-        normalized_distances(gaussians.means, view.camera, gaussians.attenuation) for view in views
-    ]
-    farthest = FAR.counted * gaussians.attenuation.max_sv
-    fewest = fmean(int(dial(gaussians, d, farthest).keep.sum()) for d in distances)
+    config = gaussians.attenuation
+    assert config is not None
+    farthest = FAR.counted * config.max_sv
+    measured = []
+    kept = []
+    for view in spread(views, MEASURED_VIEWS):
+        distances = normalized_distances(gaussians.means, view.camera, config)
+        measured.append((view.camera, view.image, distances))
+        kept.append(int(dial(gaussians, distances, farthest).keep.sum()))
     counts = [budget * gaussians.whole for budget in BUDGETS]
-    counts = [count for count in counts if count >= fewest]
+    counts = [count for count in counts if count >= fmean(kept)]
+    if not counts:
+        return gaussians
     tried = 0
 
-    def quality(candidate: Gaussians) -> list[float]:
+    def quality(candidate: Gaussians) -> Tensor:
+        """PSNR at each of the counts, dB."""
         nonlocal tried
         tell(progress, Phase.FAR_REACH, tried, 2 * MOST_STEPS)
         tried += 1
-        errors = torch.zeros(len(views), len(counts), dtype=torch.float64)
-        for i, (view, image, d) in enumerate(zip(views, images, distances, strict=True)):
-            kept = kept_between(candidate, d)
+        errors = torch.zeros(len(measured), len(counts), dtype=torch.float64)
+        for i, (camera, image, distances) in enumerate(measured):
+            between = kept_between(candidate, distances)
             for k, count in enumerate(counts):
-                s = _dial_for(kept, count)
-                rendered = render(candidate, view.camera, virtual_scale=s).image
-                errors[i, k] = mean_squared_error(rendered, image)
-        return [min(decibels(error), EXACT) for error in errors.mean(0).tolist()]
+                rendered = render(candidate, camera, virtual_scale=_dial_for(between, count))
+                errors[i, k] = mean_squared_error(rendered.image, image)
+        return -10 * (errors.mean(0) + EXACT).log10()
 
-    if not counts:
-        return gaussians
-    try:
+    with suppress(Stopped):
         best = highest = quality(gaussians)
         for factor in (1 / STEP, STEP):
             start = gaussians
             for _ in range(MOST_STEPS):
                 candidate = _with_reach(gaussians, factor)
                 found = quality(candidate)
-                lost = max(high - psnr for high, psnr in zip(highest, found, strict=True))
-                if fmean(found) <= fmean(best) or lost > LOSS:
+                if found.mean() <= best.mean() or (highest - found).max() > LOSS:
                     break
-                gaussians, best = candidate, found
-                highest = [max(pair) for pair in zip(highest, found, strict=True)]
+                gaussians = candidate
+                best = found
+                highest = highest.maximum(found)
             if gaussians is not start:
                 break
-    except Stopped:
-        pass
     return gaussians
 
 

@@ -98,15 +98,15 @@ def adapt(
     with progress_bar(False if progress is None and group and group.rank else progress) as listener:
         # for a resumed run too, the same again
         start = _initialized(reduced, views, config, listener, group)
-        empty_sh = None if reduced is base else base.shN.clone()
-        trainer = Trainer(start, views, config, group, empty_sh)
+        empty_harmonics = base.shN.shape[1] - reduced.shN.shape[1]
+        trainer = Trainer(start, views, config, group, empty_harmonics)
         trainer.start_seconds = time.perf_counter() - began
         if resume is not None:
             try:
                 trainer.restore(resume)
             except ClodError as error:
                 raise StateRejected(str(error)) from error
-        del resume, start, base, reduced, empty_sh  # the trainer has copies
+        del resume, start, base, reduced  # the trainer has copies
         return _train(trainer, listener)
 
 

@@ -77,7 +77,7 @@ def make_plan(
 def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     began = time.perf_counter()
     yield
-    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - began
+    seconds[name] = time.perf_counter() - began
 
 
 def _sh_degree(

@@ -42,7 +42,7 @@ class Trainer:
     growth.
 
     Args:
-        empty_sh: the whole shN of a base whose empty degrees were removed.
+        empty_harmonics: the number of coefficients of the empty SH degrees that were removed.
 
     Attributes:
         count: the number of trained rows, the first ones.
@@ -61,7 +61,7 @@ class Trainer:
         views: tuple[View, ...],
         config: AdaptConfig,
         group: ProcessGroup | None = None,
-        empty_sh: Tensor | None = None,
+        empty_harmonics: int = 0,
     ) -> None:
         # Places of the result's rows in training, where far ones come first.
         self.order: Tensor | None = None
@@ -72,18 +72,14 @@ class Trainer:
         form = form_of(config)
         self.rates = learning_rates(config, form.decay)
         # A frozen attribute requests no gradient from the rasterizer.
-        tuned = [
-            name
-            for name in ATTRIBUTES
-            if name == "opacity_logits" or self.rates[name] > 0 and getattr(start, name).numel()
-        ]
+        tuned = []
         attributes: Any = {}
         for name in ATTRIBUTES:
-            attributes[name] = (
-                getattr(start, name)
-                .detach()
-                .to(torch.float32, memory_format=torch.contiguous_format, copy=name in tuned)
-            )
+            values = getattr(start, name).detach().float().contiguous()
+            if name == "opacity_logits" or (self.rates[name] > 0 and values.numel()):
+                tuned.append(name)
+                values = values.clone()
+            attributes[name] = values
         splats = Gaussians(**attributes, screen_filter=start.screen_filter)
         self.dial = form(splats, start, [view.camera for view in views], config)
         dials = {name: value.detach() for name, value in self.dial.named_parameters()}
@@ -99,15 +95,18 @@ class Trainer:
         parameters_by_rows = {"kept": dict[str, Tensor](), "all": {}}
         for name, value in self.trained().items():
             parameters_by_rows["all" if name in everywhere else "kept"][name] = value
-        beta1 = BETA1**config.batch
-        beta2 = BETA2**config.batch
         units = {"means": own_sizes(start.log_scales[: self.count])}
         self.optimizers = {
-            rows: RowAdam(parameters, beta1=beta1, beta2=beta2, units=units)
+            rows: RowAdam(
+                parameters,
+                beta1=BETA1**config.batch,
+                beta2=BETA2**config.batch,
+                units=units,
+            )
             for rows, parameters in parameters_by_rows.items()
             if parameters
         }
-        self.empty_sh = empty_sh
+        self.empty_harmonics = empty_harmonics
         self.done = 0
         self.seconds = 0.0
         self.start_seconds = 0.0
@@ -166,7 +165,7 @@ class Trainer:
 
     def _view_gradients(self, sample: Sample) -> GradientSum:
         """Renders one view at its dial value, and differentiates the objective."""
-        view = sample.view
+        camera = sample.view.camera
         s = sample.dial
         trained_rows = slice(self.count)
         leaves = {
@@ -177,10 +176,10 @@ class Trainer:
         if sample.halved:
             gaussians = gaussians.replace(screen_filter=self.screen_filter.halved())
         rasterizer = for_device(gaussians.means.device)
-        kept = rasterizer.kept(gaussians, view.camera, s)[trained_rows]
-        image = rasterizer.draw(gaussians, view.camera, s, trained=self.count)[0]
-        loss = photometric_loss(image, view.image, self.config.ssim_weight)
-        total = self.dial.objective(loss, gaussians, view.camera, s)
+        kept = rasterizer.kept(gaussians, camera, s)[trained_rows]
+        image = rasterizer.draw(gaussians, camera, s, trained=self.count)[0]
+        loss = photometric_loss(image, sample.view.image, self.config.ssim_weight)
+        total = self.dial.objective(loss, gaussians, camera, s)
         stepped_gradients = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {
             name: gradient[trained_rows]
@@ -190,9 +189,8 @@ class Trainer:
         decay = self.dial.decay
         parameter = self.parameters[decay][trained_rows]
         for counted_dial, weighted in self.dial.counts(s, sample.counted, unweighted):
-            gradients[decay] = gradients[decay] + self.dial.count_gradient(
-                parameter, counted_dial, weighted
-            )
+            gradient = self.dial.count_gradient(parameter, counted_dial, weighted)
+            gradients[decay] = gradients[decay] + gradient
         return GradientSum(gradients, kept, unweighted)
 
     def _update(self, total: GradientSum, share_done: float) -> None:
@@ -253,10 +251,8 @@ class Trainer:
         gaussians = self._assembled(self.parameters | self.averages())
         if self.order is not None:
             gaussians = gaussians.select(self.order)
-        if self.empty_sh is not None:
-            far = len(gaussians) - len(self.empty_sh)
-            gaussians = gaussians.replace(shN=pad(self.empty_sh, (0, 0, 0, 0, 0, far)))
-        return in_world_units(gaussians)
+        shN = pad(gaussians.shN, (0, 0, 0, self.empty_harmonics))
+        return in_world_units(gaussians.replace(shN=shN))
 
     def averages(self) -> dict[str, Tensor]:
         """The mean parameters, of all rows; none before there is a mean."""
