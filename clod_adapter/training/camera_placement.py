@@ -15,7 +15,6 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -97,11 +96,12 @@ def place_cameras(
             cameras += placement.round(ROUND_CAMERAS)
         except ClodError:  # what is left cannot be shown
             break
-    for k, camera in enumerate(cameras):
-        zoom = float(camera.K[0, 0]) / camera.width
-        K = _intrinsics(zoom, WIDTH, HEIGHT)
-        cameras[k] = replace(camera, K=K, width=WIDTH, height=HEIGHT, name=f"placed_{k:03}")
-    return cameras
+    zoom = float(cameras[0].K[0, 0]) / cameras[0].width
+    K = _intrinsics(zoom, WIDTH, HEIGHT)
+    return [
+        replace(camera, K=K, width=WIDTH, height=HEIGHT, name=f"placed_{k:03}")
+        for k, camera in enumerate(cameras)
+    ]
 
 
 class _Placement:
@@ -124,9 +124,7 @@ class _Placement:
         self.progress = progress
         self.judged = 0  # candidates so far
         # Each row stands for growth^2 of the checkpoint's.
-        self.weight = self.sample.opacities
-        if self.growth is not None:
-            self.weight = self.weight * self.growth**2
+        self.weight = self.sample.opacities * self.growth**2
         self.hidden = torch.ones_like(self.weight)
 
     def round(self, views: int) -> list[Camera]:
@@ -159,16 +157,16 @@ class _Placement:
         twice the reach.
         """
         means = self.sample.means
-        random = partial(torch.rand, generator=self.generator)
         # torch.multinomial has a limit of 2^24 weights.
         interest = self.weight * self.hidden / self.sample.scales.amax(1).clamp(min=1e-12)
         ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
-        rows = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
+        random = torch.rand(count, generator=self.generator, dtype=torch.float64)
+        rows = torch.searchsorted(ends, random * ends[-1])
         targets = means[rows.clamp(max=len(means) - 1).to(means.device)].cpu()
         sides = torch.randn(count, 3, generator=self.generator, dtype=torch.float32)
         sides = F.normalize(sides, dim=1)
-        octaves = 2 * random(count, 1, dtype=torch.float32) - 1
-        away = self.reach * 2**octaves
+        random = torch.rand(count, 1, generator=self.generator, dtype=torch.float32)
+        away = self.reach * 2 ** (2 * random - 1)
         for eye, target in zip(targets + away * sides, targets, strict=True):
             yield _looking(eye, target, self.zoom)
 
@@ -184,16 +182,16 @@ class _Placement:
         """``count`` of the cameras by farthest-point sampling of position and direction, from the
         first one.
         """
-        points = []
-        for camera in cameras:
-            points.append(torch.cat([camera.position / self.reach, camera.viewmat[2, :3]]))
-        places = torch.stack(points)
-        chosen = [0]
-        gap = (places - places[0]).norm(dim=1)
+        positions = torch.stack([camera.position for camera in cameras])
+        directions = torch.stack([camera.viewmat[2, :3] for camera in cameras])
+        places = torch.cat([positions / self.reach, directions], 1)
+        chosen: list[Camera] = []
+        gap = torch.full((len(cameras),), torch.inf)
         while len(chosen) < min(count, len(cameras)):
-            chosen.append(int(gap.argmax()))
-            gap = gap.minimum((places - places[chosen[-1]]).norm(dim=1))
-        return [cameras[k] for k in chosen]
+            k = int(gap.argmax())
+            chosen.append(cameras[k])
+            gap = gap.minimum((places - places[k]).norm(dim=1))
+        return chosen
 
     def covered_share(self, cameras: Sequence[Camera]) -> float:
         """The share of the Gaussians, by opacity, that these cameras and those before show: COVERED
@@ -235,16 +233,18 @@ def _quantile(values: Tensor, share: float) -> float:
     return float(values.kthvalue(max(round(share * len(values)), 1)).values)
 
 
-def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, Tensor | None]:
+def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, Tensor]:
     """About SAMPLE of the Gaussians at ``rows [n]``, and the factors of their scales; all, and
-    None, if n <= SAMPLE.
+    ones, if n <= SAMPLE.
 
     One of largest scale l is drawn with probability ``p = min(1, c l)``, the sum of which is
     SAMPLE. Its scales are multiplied by ``p^-1/2``, so that surfaces are covered as before and
     walls stay opaque.
     """
     if len(rows) <= SAMPLE:
-        return gaussians.select(rows).without_empty_bands(), None
+        return gaussians.select(rows).without_empty_bands(), torch.ones_like(
+            gaussians.means[rows, 0]
+        )
     # infinite ones are not drawn
     size = gaussians.scales.amax(1)[rows].double().nan_to_num(0.0, 0.0)
     share = size * (SAMPLE / size.sum())
@@ -257,7 +257,7 @@ def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, T
     return gaussians.select(rows[selected]).without_empty_bands(), growth
 
 
-def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera, reach: float) -> float:
+def _score(gaussians: Gaussians, growth: Tensor, camera: Camera, reach: float) -> float:
     """The likelihood that a photograph was taken from here, ``log h - 0.5 p - 2 e - 1.5 b``; -inf
     if the rendering is empty, or the mean log distance that of less than NEARER of the reach.
 

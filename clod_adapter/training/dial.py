@@ -93,16 +93,11 @@ class Dial(nn.Module):
             self.total = start.whole
         self._counted = config
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
-        growth_d = start.growth_d
-        self.growth_d = (
-            None
-            if growth_d is None
-            else nn.Parameter(growth_d.detach().float().clamp(*GROWTH_RANGE))
-        )
-        typical = typical_distance(start.means, spread(cameras, MOST_VIEWS), start.attenuation)[
-            : self.trained
-        ]
-        self.register_buffer("typical", typical, persistent=False)
+        self.growth_d = None
+        if start.growth_d is not None:
+            self.growth_d = nn.Parameter(start.growth_d.detach().float().clamp(*GROWTH_RANGE))
+        typical = typical_distance(start.means, spread(cameras, MOST_VIEWS), start.attenuation)
+        self.register_buffer("typical", typical[: self.trained], persistent=False)
         self._median_size = float(own_sizes(start.log_scales).median())
         self.sampler = ViewSampler((), config, self.schedule)
         self._sampled = 0
@@ -144,27 +139,24 @@ class Dial(nn.Module):
         """
         rates = learning_rates(self.config, self.decay)
         rates["means"] *= self._median_size  # an optimizer has one rate for all rows
-        parameters: dict[str, Any] = dict(self.named_parameters())
+        parameters: dict[str, Any] = {}
         if splats:
             (attached,) = self._splats
             candidates = attached.tensors() if isinstance(attached, Gaussians) else attached
-            tuned = {
-                name: value
-                for name, value in candidates.items()
-                if getattr(value, "requires_grad", False)
-            }
-            if not tuned:
+            for name, value in candidates.items():
+                if getattr(value, "requires_grad", False):
+                    parameters[name] = value
+            if not parameters:
                 raise ClodError(
                     "no splat requires a gradient: attach copies with requires_grad_(), or leave"
                     " out splats=True"
                 )
-            # growth_d is the dial's own
-            parameters |= {name: value for name, value in tuned.items() if name not in parameters}
+        parameters |= self.named_parameters()  # growth_d is the dial's own
         groups = []
         for name, value in parameters.items():
-            rate = rates.get(ATTRIBUTE_OF.get(name, name))
-            if rate is not None:
-                groups.append({"params": [value], "lr": rate, "name": name})
+            attribute = ATTRIBUTE_OF.get(name, name)
+            if attribute in rates:
+                groups.append({"params": [value], "lr": rates[attribute], "name": name})
         return groups
 
     def sample(self) -> float:
@@ -219,10 +211,10 @@ class Dial(nn.Module):
         """
         if counted is None:
             return []
-        at_virtual_scale = (
-            [(virtual_scale, self.weight(virtual_scale) * loss)] if virtual_scale >= 1 else []
-        )
-        return [*at_virtual_scale, (counted, loss)]
+        terms = [(counted, loss)]
+        if virtual_scale >= 1:
+            terms.insert(0, (virtual_scale, self.weight(virtual_scale) * loss))
+        return terms
 
     def objective(
         self, loss: Tensor, gaussians: Gaussians, camera: Camera, virtual_scale: float
@@ -320,10 +312,9 @@ def attach(
     config = replace(config or AdaptConfig(), **settings)
     if config.form != "ours":
         raise ClodError(f"attach has no form {config.form}: call adapt, or leave the form out")
-    views_or_cameras = scene.train if isinstance(scene, Scene) else scene
     views = tuple(
         item if isinstance(item, View) else StoredView(item, _no_photograph)
-        for item in views_or_cameras
+        for item in (scene.train if isinstance(scene, Scene) else scene)
     )
     base = splats if isinstance(splats, Gaussians) else from_gsplat(splats)
     base = base.replace(**{name: value.detach() for name, value in base.tensors().items()})

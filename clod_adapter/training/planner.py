@@ -65,7 +65,8 @@ def make_plan(
     if added := len(initial) - len(base):
         why = "take over in the distance from the checkpoint's own, which stay as they are"
         decisions.append(Decision("far Gaussians", "added", float(added), "", why))
-    decisions += _far_end(initial, views, config)
+    if config.form == "ours" and config.max_sv > 1:
+        decisions.append(_far_end(initial, views, config))
     frozen = [name for name in RATES if name in override.leave_out]
     decisions += [Decision(name, "frozen", None, "", REQUESTED, name) for name in frozen]
     decisions += [Decision(item, NOT_NEEDED, None, "", why) for item, why in scene.left_out]
@@ -94,29 +95,29 @@ def _sh_degree(
         return 0, [Decision("SH degrees", "left out", None, "", REQUESTED, "bands")]
     degree = highest
     decisions = list[Decision]()
+    plural = "s" if len(views) > 1 else ""
+    why = f"change without, {len(views)} training view{plural}"
     for band, loss in sh_degree_losses(base, views, LIMIT):
-        several = band < highest
-        degrees = f"{band} to {highest}" if several else f"{band}"
-        why = f"change without {'them' if several else 'it'}, {_counted(len(views))}"
+        what = f"SH degree {band}"
+        if band < highest:
+            what += f" to {highest}"
         if loss < LIMIT:  # one decision for all that are left out
             degree = band - 1
-            decisions = []
-        verdict = "left out" if loss < LIMIT else "kept"
-        decisions.append(Decision(f"SH degree {degrees}", verdict, loss, "dB", why, "bands"))
+            decisions = [Decision(what, "left out", loss, "dB", why, "bands")]
+        else:
+            decisions.append(Decision(what, "kept", loss, "dB", why, "bands"))
         tell(progress, Phase.SH_DEGREES, highest - band + 1, highest)
     return degree, decisions
 
 
-def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> list[Decision]:
+def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> Decision:
     """The share of the Gaussians that the largest dial value will keep, and the one that would keep
     FEW.
     """
-    if config.form == "paper" or config.max_sv == 1:
-        return []
     assert initial.attenuation is not None
-    cameras = [view.camera for view in spread(views, MEASURED_VIEWS)]
     distances = [
-        normalized_distances(initial.means, camera, initial.attenuation) for camera in cameras
+        normalized_distances(initial.means, view.camera, initial.attenuation)
+        for view in spread(views, MEASURED_VIEWS)
     ]
 
     def share(s: float) -> float:
@@ -128,13 +129,8 @@ def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> 
         farther *= FARTHER
     if config.max_sv < farther < FARTHEST:
         reached += f", {FEW:.0%} with --max-sv {farther:.2g}"
-    return [
-        Decision(reached, "kept", None, "", "in the mean of the training views, before training")
-    ]
-
-
-def _counted(views: int) -> str:
-    return f"{views:,} training view{'s' if views > 1 else ''}"
+    why = "in the mean of the training views, before training"
+    return Decision(reached, "kept", None, "", why)
 
 
 @torch.no_grad()

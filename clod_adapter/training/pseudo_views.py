@@ -102,21 +102,21 @@ def render_pseudo_views(
         >>> scene = clod.render_pseudo_views(base.gaussians, cameras)
     """
     teacher = gaussians.without_empty_bands()
-    held_out = range(0, len(cameras), TEST_EVERY) if len(cameras) > 1 else range(0)
-    views = _views(teacher, cameras, backed=BACKED)
-    train = tuple(view for k, view in enumerate(views) if k not in held_out)
+    train = _views(teacher, cameras, backed=BACKED)
     test = list[View]()
-    for k in held_out:
-        pixels = render(teacher, cameras[k]).pixels.cpu()
-        test.append(View(cameras[k], pixels))
-        tell(progress, Phase.PSEUDO_VIEWS, len(test), len(held_out))
+    if len(cameras) > 1:
+        held_out = train[::TEST_EVERY]
+        del train[::TEST_EVERY]
+        for view in held_out:
+            test.append(View(view.camera, view.image))
+            tell(progress, Phase.PSEUDO_VIEWS, len(test), len(held_out))
     size = f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"
     note = (
         f"no photographs: {len(train)} pseudo views to train on, {len(test)} held out, {size}; the"
         " checkpoint is the teacher, and all numbers compare with its renderings, not with"
         " photographs"
     )
-    return Scene(train, tuple(test), (note,))
+    return Scene(tuple(train), tuple(test), (note,))
 
 
 def with_pseudo_views(
@@ -193,13 +193,14 @@ def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
 
 def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
     """The views with their teachers on ``device``: equal ones once, as a checkpoint is large."""
-    teachers = {id(view.teacher): view.teacher for view in views if isinstance(view, PseudoView)}
-    on_device = {number: teacher.to(device) for number, teacher in teachers.items()}
+    on_device = dict[int, Gaussians]()
     moved = list[View]()
     for view in views:
         if isinstance(view, PseudoView):
-            teacher = on_device[id(view.teacher)]
-            view = PseudoView(view.camera, teacher, view.reach, view.backed)
+            number = id(view.teacher)
+            if number not in on_device:
+                on_device[number] = view.teacher.to(device)
+            view = PseudoView(view.camera, on_device[number], view.reach, view.backed)
         moved.append(view)
     return tuple(moved)
 

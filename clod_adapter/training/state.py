@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ class TrainingState:
                 sound = values.abs() <= 10 * self.tensors[f"second.{attribute}"].sqrt() + 1e-15
             else:  # an infinite opacity does not change
                 sound = values.isfinite() | (values == expected[f"parameter.{attribute}"])
-            if not bool(sound.all()):
+            if not sound.all():
                 raise StateRejected(
                     f"the training state has impossible values of {name}; start over"
                 )
@@ -144,15 +144,11 @@ def extract_adapter(base: Checkpoint, adapted: Adapted, config: AdaptConfig) -> 
 
 def save_state(path: str | Path, state: TrainingState, run_metadata: dict[str, Any]) -> None:
     """Writes a state, and plain JSON that identifies its run; loading gives the same bits."""
-    # Not asdict of the whole, which would copy the tensors.
-    about = {f.name: getattr(state, f.name) for f in fields(state) if f.name != "tensors"}
-    metadata = {
-        KEY: json.dumps(
-            {**about, "attenuation": asdict(state.attenuation), "belongs": run_metadata}
-        )
-    }
+    about = dict(vars(state))
+    del about["tensors"]
+    about |= {"attenuation": asdict(state.attenuation), "belongs": run_metadata}
     with atomic_path(path) as temporary:
-        write_tensors(temporary, state.tensors, metadata)
+        write_tensors(temporary, state.tensors, {KEY: json.dumps(about)})
 
 
 def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
@@ -166,9 +162,15 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
         about = json.loads(metadata[KEY])
         run_metadata = dict(about.pop("belongs"))
         attenuation = AttenuationConfig(**about.pop("attenuation"))
-        random = dict(about.pop("random"))
-        order = tuple(map(int, about.pop("order")))
-        counts: Any = {
-            name: (int if name in ("averaged", "steps") else float)(n) for name, n in about.items()
-        }
-        return TrainingState(tensors, attenuation, random, order, **counts), run_metadata
+        state = TrainingState(
+            tensors,
+            attenuation,
+            random=dict(about["random"]),
+            order=tuple(map(int, about["order"])),
+            loss=float(about["loss"]),
+            averaged=int(about["averaged"]),
+            steps=int(about["steps"]),
+            seconds=float(about["seconds"]),
+            start_seconds=float(about["start_seconds"]),
+        )
+        return state, run_metadata
