@@ -61,7 +61,7 @@ def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
         data_range=1,
         channel_axis=-1,
     )
-    return psnr(image, target), float(similarity)
+    return psnr(clamped, target), float(similarity)
 
 
 def ssim_plain(image: Tensor, target: Tensor) -> Tensor:

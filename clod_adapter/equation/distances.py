@@ -56,10 +56,9 @@ def normalizing_distance(
     plane, or over all where there is none. It is at least the smallest normal number, so that 0 / D
     is 0, and 1 where there are no Gaussians.
     """
-    if config.form == "ours":
-        return distances.new_tensor(config.scene_distance)
-    if len(distances) == 0:
-        return distances.new_tensor(1.0)
+    if config.form == "ours" or len(distances) == 0:
+        value = config.scene_distance if config.form == "ours" else 1.0
+        return torch.full((), value, dtype=distances.dtype, device=distances.device)
     inside = in_frustum(means, camera)
     # Without a selection, for whose size the host would wait for a GPU.
     largest = distances.where(inside | ~inside.any(), 0).max()
@@ -95,7 +94,9 @@ def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Vi
     """
     position = camera.position.to(means)
     distances = (means - position).norm(dim=1)
-    unit = float(normalizing_distance(distances, means, camera, config))
+    unit = config.scene_distance
+    if config.form == "paper":
+        unit = float(normalizing_distance(distances, means, camera, config))
     look = camera.viewmat[2, :3].tolist()
     up = (-camera.viewmat[1, :3]).tolist()
     fov = 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))

@@ -190,10 +190,6 @@ ERRORS = [
         "export bare.ply -o x.ply --sv 2 --tune",
         "--tune is for dial values that are baked for all cameras",
     ),
-    (
-        "export bare.ply -o x.ply --sv 2 --tune",
-        "--tune needs the photographs that it was adapted on",
-    ),
     ("apply bare.ply dial.safetensors -o x.ply", "bare.ply: a different base was given"),
     ("apply base.ply dial.safetensors -o pipe.ply", "pipe.ply: is no regular file"),
     ("view empty", "empty: has no splat in it; give the file"),

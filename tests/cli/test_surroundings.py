@@ -61,7 +61,6 @@ def test_full_disk_while_adapting(clod, attenuated, tmp_path):
         report = (done := clod(words, "--report --json")).report
     assert "the page was not written: " in done.err and "page" not in report["outputs"]
     assert report["rows"]
-    assert report["seconds"]["page"] > 0
     assert "the page was not" in report["notes"][-1]
     assert report == json.loads((tmp_path / "dial.json").read_text())
     now = contents(tmp_path)
