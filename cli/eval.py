@@ -34,8 +34,9 @@ PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    text = "an adapted file, or a plain one as a baseline"
-    given = common.add_input(parser, "model", "MODEL.ply", text)
+    given = common.add_input(
+        parser, "model", "MODEL.ply", "an adapted file, or a plain one as a baseline"
+    )
     common.add_reading(given)
     dial = parser.add_argument_group("dial values, one of")
     default = (
@@ -43,8 +44,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     common.add_dial_options(dial, default, "(mean over the held-out views)", several=True)
     measuring = parser.add_argument_group("measuring")
-    text = "also measure the checkpoint, pruned to the count of each row"
-    measuring.add_argument("--base", metavar="BASE.ply", help=text)
+    measuring.add_argument(
+        "--base",
+        metavar="BASE.ply",
+        help="also measure the checkpoint, pruned to the count of each row",
+    )
     text = "also measure other files, each beside MODEL.ply at the same number of Gaussians"
     measuring.add_argument("--against", metavar="FILE.ply", nargs="+", default=[], help=text)
     text = "also measure how evenly the image changes with the dial and the camera"

@@ -19,7 +19,7 @@ from clod_adapter.progress import GracefulStop, Listener
 from clod_adapter.report.charts import check_matplotlib
 
 from .shared import command as common
-from .shared.console import Console, ProgressDisplay, duration
+from .shared.console import Console, ProgressDisplay
 from .shared.outputs import Outputs, Report, labels, write_report
 
 if TYPE_CHECKING:
@@ -213,7 +213,6 @@ def execute(args: Namespace) -> Report:
         print(path)
     if missing:
         print(f"\nmissing: {', '.join(missing)}; the same command continues")
-    print(f"\n{duration(watch.total())} in all")
     return report
 
 

@@ -33,8 +33,7 @@ def levels_of(text: str) -> list[float]:
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    text = "an adapted file, or a plain one to convert"
-    given = common.add_input(parser, "model", "MODEL", text)
+    given = common.add_input(parser, "model", "MODEL", "an adapted file, or a plain one to convert")
     given.add_argument(
         "others", metavar="OTHER", nargs="*", help=f"more of them, to switch to in an {PAGE} page"
     )
@@ -50,8 +49,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     values.add_argument(
         "--levels", metavar="S,S,...", type=levels_of, help="dial values, each baked into a file"
     )
-    text = "output file; its suffix is the format"
-    output = common.add_out(parser, "OUT", text, required=True)
+    output = common.add_out(parser, "OUT", "output file; its suffix is the format", required=True)
     sets = output.add_mutually_exclusive_group()
     for option, form in (
         ("--lod-meta", "streaming set for PlayCanvas's viewers"),

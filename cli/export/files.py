@@ -97,10 +97,8 @@ def line_of(output: Report, total: int) -> str:
         return f"{line} Gaussians in {len(levels)} levels, by distance: {shown}"
     if output["virtual_scale"] is None:
         return f"{line} Gaussians"
-    about = f"of {total:,} Gaussians,"
-    if output["file"].lower().endswith(PAGE):
-        about = "Gaussians, initial dial value"
-    return f"{line} {about} s = {output['virtual_scale']:.5g}"
+    of = f" of {total:,}" if output["count"] < total else ""
+    return f"{line}{of} Gaussians, s = {output['virtual_scale']:.5g}"
 
 
 class Export:

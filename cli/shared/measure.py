@@ -190,7 +190,7 @@ def solve_dials(
             )
     dials = []
     for value in values:
-        asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
+        asked = f"{option} {value:.12g}"
         budget_for: dict[str, Any] = {name: value, "cameras": cameras, "baked": baked}
         try:
             if times:

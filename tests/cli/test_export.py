@@ -333,7 +333,7 @@ def test_page_holds_the_splat_and_its_dial(clod, attenuated, tmp_path):
     done, config, held = page("--sv 9 --images SCENE", name="held.spz")
     assert config["model"]["name"] == attenuated.name and config["virtual_scale"] == 4
     assert done.note("dial ends at s = 4")
-    assert "Gaussians, initial dial value s = 4" in done.err
+    assert "300 Gaussians, s = 4" in done.err
     assert " of " not in done.err.splitlines()[-1]
     assert [camera["name"] for camera in config["cameras"]] == [f"{k:03}.png" for k in range(10)]
     assert held.gaussians.whole == done.output["count"] == 300
