@@ -45,9 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     common.add_dial_options(dial, default, "(mean over the held-out views)", several=True)
     measuring = parser.add_argument_group("measuring")
     measuring.add_argument(
-        "--base",
-        metavar="BASE.ply",
-        help="also measure the checkpoint, pruned to the count of each row",
+        "--base", metavar="BASE.ply", help="also measure the checkpoint, pruned to each row's count"
     )
     text = "also measure other files, each beside MODEL.ply at the same number of Gaussians"
     measuring.add_argument("--against", metavar="FILE.ply", nargs="+", default=[], help=text)
