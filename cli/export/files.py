@@ -43,9 +43,9 @@ from .names import FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 PLACED = 16  # cameras placed where none are known
 SETTINGS = {
     "--lod-meta": (
-        "in PlayCanvas: lodBaseDistance = {begins:.4g}, lodMultiplier = {multiplier:g}, and a"
-        " splatBudget below the finest level's number; within the budget it draws that level"
-        " everywhere"
+        "in PlayCanvas: lodBaseDistance = {begins:.4g}, lodMultiplier = {multiplier:g},"
+        " minPixelSize = 0, as it else leaves out what is small, and a splatBudget below the finest"
+        " level's number; within the budget it draws that level everywhere"
     ),
     "--3dtiles": (
         "in CesiumJS with maximumScreenSpaceError = 16, its default, level 1 begins at {begins:.4g}"

@@ -269,7 +269,9 @@ def test_splat_transform(clod, attenuated, tmp_path, tool):
     assert said["sizes"][0] > 92 * done.output["count"]
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
     (tmp_path / "-o").mkdir()  # empty; not an option of the tool
-    output = clod(EXPORT, "--lod-meta --out=-o").output
+    done = clod(EXPORT, "--lod-meta --out=-o")
+    output = done.output
+    assert "minPixelSize = 0" in done.err
     counts = [len(level.gaussians) for level in bake_levels(load(attenuated).gaussians)]
     assert [level["count"] for level in output["levels"]] == counts
     assert output["count"] == sum(counts)
