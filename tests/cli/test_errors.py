@@ -124,7 +124,7 @@ ERRORS = [
     ),
     (
         "eval dial.ply --images scene --fps 1e7",
-        r"--fps 1e\+07: .*at s = 4, .* a frame takes \S+ ms",
+        r"--fps 10000000: .*at s = 4, .* a frame takes \S+ ms",
     ),
     (
         "eval base.ply --images scene --report page.txt",
