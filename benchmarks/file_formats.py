@@ -26,7 +26,7 @@ DIALS = (1.0, 5.0)
 HEADS = [
     "format",
     "sigma_d, growth_d",
-    "settings, calibration, origin",
+    "settings, quality table, origin",
     "bytes per Gaussian (SH 3)",
     "error of sigma_d",
     "image against the PLY's, s = 1 / s = 5",

@@ -254,10 +254,14 @@ def page_table(scene):
     rows = []
     lines = {}
     for method, label in SHOWN.items():
-        line = [found[key] for budget in BUDGETS if (key := (method, f"{budget:.0%}")) in found]
-        rows += line
-        if line:
-            lines[label] = [row["psnr"] for row in line]
+        line = [found.get((method, f"{budget:.0%}")) for budget in BUDGETS]
+        if any(line):
+            rows += filter(None, line)
+            # none where a set cannot be so small: nodes around the camera stay at its finest level
+            lines[label] = [
+                row["psnr"] if row and row["share"] < 1.2 * budget else None
+                for row, budget in zip(line, BUDGETS, strict=True)
+            ]
     heads = [f"{SCENES[scene]} (`{scene}`), budget", *percent(BUDGETS)]
     return Table(heads, with_best(lines, ".1f"), rows)
 

@@ -46,7 +46,7 @@ def execute(args: Namespace) -> Report:
         adapted = adapter.apply(base.gaussians, base.fingerprint)
     except ClodError as error:
         raise ClodError(f"{args.base}: {error}") from error
-    save(args.out, adapted, base, version=adapter.version, calibration=adapter.calibration)
+    save(args.out, adapted, base, version=adapter.version, quality_table=adapter.quality_table)
     dial = " and ".join(dial_tensors(adapted))
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
     return {

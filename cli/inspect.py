@@ -16,7 +16,7 @@ from .shared.command import add_input
 from .shared.outputs import Report, size
 
 if TYPE_CHECKING:
-    from clod_adapter import Calibration
+    from clod_adapter import QualityTable
     from clod_adapter.inspection.report import Inspection
     from clod_adapter.inspection.statistics import Splat, Spread
 
@@ -83,7 +83,7 @@ def splat_lines(splat: Splat) -> list[str]:
     form = "the paper's form" if attenuation.form == "paper" else "distances in world units"
     settings = f"{splat.dial_columns}, s = 1 to {attenuation.max_sv:g}, {form}"
     lines.append(_line("dial", settings))
-    return lines + calibration_lines(splat.dial.calibration)
+    return lines + quality_lines(splat.dial.calibration)
 
 
 def spread_table(rows: Sequence[tuple[str, Spread | None]]) -> list[str]:
@@ -94,13 +94,13 @@ def spread_table(rows: Sequence[tuple[str, Spread | None]]) -> list[str]:
     return [*lines, ""]
 
 
-def calibration_lines(calibration: Calibration | None) -> list[str]:
-    """The calibration of the file."""
-    if calibration is None:
-        return [_line("calibration", "none, so --fps and --psnr-drop cannot be solved from it")]
-    c = calibration
+def quality_lines(quality_table: QualityTable | None) -> list[str]:
+    """The quality table of the file."""
+    if quality_table is None:
+        return [_line("quality table", "none, so --fps and --psnr-drop cannot be solved from it")]
+    c = quality_table
     about = f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}"
-    lines = [_line("calibration", about)]
+    lines = [_line("quality table", about)]
     lines.append(_line("", f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}"))
     numbers = "{:>6.3g}{:>12,.0f}{:>9.2f}{:>8.3f}{:>10.1f}"
     return lines + [_line("", numbers.format(*astuple(row))) for row in c.rows]

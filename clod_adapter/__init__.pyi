@@ -7,7 +7,6 @@ from .adapter import with_dial as with_dial
 from .bake import bake as bake
 from .bake import bake_levels as bake_levels
 from .bake import order_by_extinction as order_by_extinction
-from .calibration import Calibration as Calibration
 from .cameras import Camera as Camera
 from .cameras import Scene as Scene
 from .cameras import View as View
@@ -34,6 +33,7 @@ from .pipeline import adapt_checkpoint as adapt_checkpoint
 from .progress import Phase as Phase
 from .progress import Progress as Progress
 from .progress import Stopped as Stopped
+from .quality_table import QualityTable as QualityTable
 from .render import Rendering as Rendering
 from .render import render as render
 from .training.camera_placement import place_cameras as place_cameras

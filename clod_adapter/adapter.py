@@ -10,13 +10,13 @@ from torch import Tensor
 
 from clod_adapter._support.arrays import tensor_of
 from clod_adapter._support.text import package_version
-from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter, require
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, describe_dial, with_near
 from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.quality_table import QualityTable
 
 HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
 ATTRIBUTES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
@@ -37,8 +37,8 @@ class Adapter:
         config: the training config, JSON-able, for the record.
         version: of the package that made it; it stands in the header of the PLY, which is so the
             same again.
-        calibration: what the result's dial values keep, cost and take, where that was measured; in
-            the header too.
+        quality_table: what the result's dial values keep, cost and take, where that was measured;
+            in the header too.
         origin: ``[3]`` what the base's means were relative to, world units (``Checkpoint.origin``).
         screen_filter: that it was trained with, and the result is drawn with.
         growth_d: ``[N]`` float32, finite, exponents of the growth of the scales. None for no
@@ -58,7 +58,7 @@ class Adapter:
     base_fingerprint: str
     config: dict[str, Any]
     version: str = field(default_factory=package_version)
-    calibration: Calibration | None = None
+    quality_table: QualityTable | None = None
     origin: Origin = NOWHERE
     screen_filter: ScreenFilter = CLASSIC
     growth_d: Tensor | None = None

@@ -12,7 +12,7 @@ from clod_adapter.alignment.align import Note, align, detect_filter
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.calibrate import calibrate, report_dials, with_frame_times
+from clod_adapter.evaluation.calibrate import make_quality_table, report_dials, with_frame_times
 from clod_adapter.evaluation.evaluate import Row, evaluate_all
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import save_adapter
@@ -72,8 +72,8 @@ class Result:
         """Writes the two files under these names."""
         save_adapter(adapter, self.adapter)
         version = self.adapter.version
-        calibration = self.adapter.calibration
-        save(ply, self.gaussians, self.base, version=version, calibration=calibration)
+        quality_table = self.adapter.quality_table
+        save(ply, self.gaussians, self.base, version=version, quality_table=quality_table)
 
 
 def adapt_checkpoint(
@@ -128,7 +128,7 @@ def adapt_checkpoint(
     if scene.test and not adapted.interrupted:
         try:
             measured = _measured(result, config.max_sv, progress, notes.append)
-            result = calibrated(measured, notes.append)
+            result = with_quality_table(measured, notes.append)
         except Stopped as stopped:
             notes.append(f"the result is not measured: {stopped}")
     return replace(result, notes=tuple(dict.fromkeys(notes)))
@@ -144,16 +144,16 @@ def extract_result(
     return Result(base, scene, against, plan, adapted, adapter, adapter.apply(base.gaussians))
 
 
-def calibrated(result: Result, note: Note) -> Result:
-    """The result with the calibration of its rows in its adapter, or a note that there is none."""
+def with_quality_table(result: Result, note: Note) -> Result:
+    """The result with the quality table of its rows in its adapter, or a note without one."""
     try:
-        calibration = calibrate(
+        quality_table = make_quality_table(
             result.rows, result.gaussians, result.scene, result.against, result.base.origin
         )
     except ClodError as error:
-        note(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
+        note(f"the files have no quality table, so --fps and --psnr-drop will not work: {error}")
         return result
-    return replace(result, adapter=replace(result.adapter, calibration=calibration))
+    return replace(result, adapter=replace(result.adapter, quality_table=quality_table))
 
 
 def _measured(result: Result, max_sv: float, progress: Listener | None, note: Note) -> Result:

@@ -2,7 +2,7 @@
 
     python examples/05_budgets.py adapted.ply scene/
 
-The file must be one that ``clod-adapt`` wrote, for the loss is read off the calibration in its
+The file must be one that ``clod-adapt`` wrote, for the loss is read off the quality table in its
 header. Counts are solved for exactly, over the scene's held-out cameras; for the frame rate some
 frames are timed here and now.
 """
@@ -29,7 +29,12 @@ def main(model: str, folder: str) -> None:
             cameras=cameras,
         )
     for drop in DROPS:
-        show(f"{drop:g} dB given up", gaussians, psnr_drop=drop, calibration=checkpoint.calibration)
+        show(
+            f"{drop:g} dB given up",
+            gaussians,
+            psnr_drop=drop,
+            quality_table=checkpoint.quality_table,
+        )
     for rate in RATES:
         show(f"{rate} frames a second", gaussians, fps=rate, cameras=cameras)
 

@@ -27,7 +27,7 @@ def main(checkpoint: str, adapter_file: str, out: str = "again.ply") -> None:
 
     # Save. Everything but the base is in the small file; the large one is made again from it, the
     # same bytes each time.
-    clod.save(out, adapted, base, version=adapter.version, calibration=adapter.calibration)
+    clod.save(out, adapted, base, version=adapter.version, quality_table=adapter.quality_table)
     small, large = Path(adapter_file).stat().st_size, Path(out).stat().st_size
     print(f"wrote {out}: {large:,} bytes, of which {small:,} are the adapter's")
 

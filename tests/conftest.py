@@ -115,7 +115,7 @@ def captured():
 
 @pytest.fixture(scope="session")
 def attenuated(capture, tmp_path_factory):
-    """The capture's checkpoint with a dial up to 4 and its calibration, as clod-adapt writes it."""
+    """The capture's checkpoint with a dial up to 4 and its quality table, as clod-adapt writes."""
     path = tmp_path_factory.mktemp("attenuated") / "dial.ply"
     words = f"{capture.ply} --images {capture.scene} --iters 12 --max-sv 4 --out {path} --quiet"
     assert main(accepted(words.split())) == 0

@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
-from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.io.checkpoint import load, save
+from clod_adapter.quality_table import QualityRow, QualityTable
 from scenes import gaussians, seeded
 
 ATTENUATION = AttenuationConfig(reference_distance=3.217, max_sv=7.0)
-CALIBRATION = Calibration((CalibrationRow(1, 30, 29.1, 0.9, 2.5),), 40, 3, 64, 48, "a machine")
+QUALITY_TABLE = QualityTable((QualityRow(1, 30, 29.1, 0.9, 2.5),), 40, 3, 64, 48, "a machine")
 ORIGIN = (5.1e5, -4096.0, 0.25)
 # of the fixture ``capture``
 PACKED = Path(__file__).parent / "io" / "of_splat_transform" / "capture.compressed.ply"

@@ -135,7 +135,7 @@ def assert_equal(a, b):
 
 
 def stripped(data):
-    """A file without its calibration's times, which are not reproducible."""
+    """A file without its quality table's times, which are not reproducible."""
     if data.startswith(b"ply"):
         return re.sub(rb"(?m)^(comment clod_adapter calibrated .*) \S+$", rb"\1", data)
     text = re.sub(rb'\\"frame_ms\\": [0-9.e-]+', b"", data[8:])

@@ -1,4 +1,4 @@
-"""Settings and the calibration table: impossible values are refused, and exact round trips through
+"""Settings and the quality table: impossible values are refused, and exact round trips through
 adapter and PLY.
 """
 
@@ -11,10 +11,10 @@ import torch
 from refusals import refused
 
 from clod_adapter import extract, load, load_adapter, save, save_adapter, with_dial
-from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter, field_descriptions
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.evaluation.evaluate import Row
+from clod_adapter.quality_table import QualityRow, QualityTable, Viewpoint
 from scenes import gaussians, ring
 
 BOTH = {"form": ["theirs"], "max_sv": [0.99, math.inf, math.nan]}
@@ -83,7 +83,7 @@ def test_round_trips(tmp_path):
         Row(1 + 2**-52, -1e-300, 0.1 + 0.2, -1 / 7, 0.5, 1.0, 1e-9),
         Row(299.9, 1e6, 5e-324, 0.0, 0.5, 1.0, 1e6),
     ]
-    calibration = Calibration.of(
+    quality_table = QualityTable.of(
         measured,
         total=4,
         views=13,
@@ -94,12 +94,14 @@ def test_round_trips(tmp_path):
     )
     base = gaussians(4, 0, 0)
     attenuated = with_dial(base, torch.ones(4))
-    save(tmp_path / "a.ply", attenuated, calibration=calibration)
-    assert load(tmp_path / "a.ply").calibration == calibration
+    save(tmp_path / "a.ply", attenuated, quality_table=quality_table)
+    assert load(tmp_path / "a.ply").quality_table == quality_table
     assert load(tmp_path / "a.ply").notes == ()
-    adapter = replace(extract(base, attenuated, fingerprint="", config={}), calibration=calibration)
+    adapter = replace(
+        extract(base, attenuated, fingerprint="", config={}), quality_table=quality_table
+    )
     save_adapter(tmp_path / "a.safetensors", adapter)
-    assert load_adapter(tmp_path / "a.safetensors").calibration == calibration
+    assert load_adapter(tmp_path / "a.safetensors").quality_table == quality_table
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0]
     assert header.isascii() and max(map(len, header.splitlines())) < 200
 
@@ -107,13 +109,13 @@ def test_round_trips(tmp_path):
 def test_rows_of_an_evaluation():
     rows = [Row(s, 30 - s, 0.9, 100 / s, 1 / s, 50 / s, 10 / s) for s in (2.0, 1.0)]
     machine = " AMD\tRyzen\u2122  9\n"
-    table = Calibration.of(rows, total=100, views=3, size=(64, 48), machine=machine)
-    near = CalibrationRow(1.0, 100.0, 29.0, 0.9, 10.0)
-    assert table.rows == (near, CalibrationRow(2.0, 50.0, 28.0, 0.9, 5.0))
+    table = QualityTable.of(rows, total=100, views=3, size=(64, 48), machine=machine)
+    near = QualityRow(1.0, 100.0, 29.0, 0.9, 10.0)
+    assert table.rows == (near, QualityRow(2.0, 50.0, 28.0, 0.9, 5.0))
     assert table.machine == "AMD Ryzen? 9" and table.width == 64 and table.height == 48
 
 
-ROW = CalibrationRow(1.0, 10.0, 30.0, 0.9, 5.0)
+ROW = QualityRow(1.0, 10.0, 30.0, 0.9, 5.0)
 GOOD = {"rows": (ROW,), "total": 4, "views": 1, "width": 8, "height": 8, "machine": "m"}
 PLACE = Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8)
 
@@ -122,18 +124,18 @@ PLACE = Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8)
     "good, bad, said",
     [
         *(
-            (Calibration(**GOOD), {"rows": rows}, "ascend from 1")
+            (QualityTable(**GOOD), {"rows": rows}, "ascend from 1")
             for rows in ((), (replace(ROW, virtual_scale=2.0),), (ROW, ROW))
         ),
-        (Calibration(**GOOD), {"rows": (replace(ROW, psnr=float("inf")),)}, "out of range"),
-        (Calibration(**GOOD), {"rows": (replace(ROW, frame_ms=0.0),)}, "out of range"),
-        (Calibration(**GOOD), {"total": 0}, "out of range"),
+        (QualityTable(**GOOD), {"rows": (replace(ROW, psnr=float("inf")),)}, "out of range"),
+        (QualityTable(**GOOD), {"rows": (replace(ROW, frame_ms=0.0),)}, "out of range"),
+        (QualityTable(**GOOD), {"total": 0}, "out of range"),
         (
-            Calibration(**GOOD),
+            QualityTable(**GOOD),
             {"against": "thin air"},
             "'thin air', it must be one of photographs, checkpoint",
         ),
-        (Calibration(**GOOD), {"machine": "caf\u00e9"}, "machine"),
+        (QualityTable(**GOOD), {"machine": "caf\u00e9"}, "machine"),
         (PLACE, {"x": float("nan")}, "the centre of a viewpoint is"),
         (PLACE, {"unit": 0.0}, "the unit of a viewpoint is"),
         *((PLACE, bad, "the direction of a viewpoint is") for bad in ({"up_x": 7.0}, {"fov": -1})),
@@ -152,7 +154,7 @@ def test_stored_viewpoints_are_cameras_again(tmp_path):
     viewpoints = tuple(viewpoint_of(camera, points, AttenuationConfig()) for camera in cameras)
     # one without a direction is no camera
     for places, count in ((viewpoints, 3), ((Viewpoint(1.5, 2.5, 3.5, 4.5),), 0)):
-        save(path, attenuated, calibration=Calibration(**GOOD, viewpoints=places))
+        save(path, attenuated, quality_table=QualityTable(**GOOD, viewpoints=places))
         stored = load(path)
         assert stored.viewpoints == places and len(stored.cameras) == count
         for camera, again in zip(cameras, stored.cameras, strict=False):

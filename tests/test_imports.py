@@ -21,7 +21,7 @@ ORDER = [
     {"errors"},
     {"_kernels", "config"},
     {"cameras"},
-    {"calibration", "frame_rate", "gaussians", "losses"},
+    {"quality_table", "frame_rate", "gaussians", "losses"},
     {"equation"},
     {"hook", "progress", "rasterizers"},
     {"adapter", "integrations", "render"},

@@ -90,8 +90,8 @@ is set when rendering: 1 is full quality; at s about s^-1.5 of them are drawn.
 USAGE = "PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]"
 EPILOG = """\
 outputs (existing files are replaced):
-  OUT.ply          the splat with sigma_d and growth_d, and a calibration in its
-                   header: dial value, count, PSNR, SSIM and frame time
+  OUT.ply          the splat with sigma_d and growth_d; its header has a table
+                   of dial value, count, PSNR, SSIM and frame time
   OUT.safetensors  the adapter: "clod-adapt apply" rebuilds OUT.ply from it
   OUT.json         the report: settings, machine, times, and quality on held-out
                    photographs (every 8th by name) per dial value

@@ -13,7 +13,7 @@ from clod_adapter._support.machine import machine
 from clod_adapter._support.text import package_version
 from clod_adapter.evaluation.calibrate import report_dials
 from clod_adapter.io.atomic import atomic_paths
-from clod_adapter.pipeline import calibrated, extract_result
+from clod_adapter.pipeline import extract_result, with_quality_table
 from clod_adapter.progress import GracefulStop
 from clod_adapter.training.state import Adapted
 
@@ -123,21 +123,21 @@ def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
         base_rows, rows, plain = comparable(measured, views, console, stop)
     run.cut = stop.requests > 0
     result = replace(result, base_rows=base_rows, rows=rows, plain=plain)
-    return result if run.cut or not rows else calibrated(result, console.say)
+    return result if run.cut or not rows else with_quality_table(result, console.say)
 
 
 def write_result(run: Run, result: Result) -> Report:
     """Writes the three files, all before the first replaces that of an earlier run, and returns the
     report.
     """
-    outputs, console, calibration = run.outputs, run.console, result.adapter.calibration
+    outputs, console, quality_table = run.outputs, run.console, result.adapter.quality_table
     report = describe(run, result)
     with (
         console.status(f"writing {outputs.ply} ..."),
         atomic_paths(outputs.adapter, outputs.ply, outputs.report) as (small, large, about),
     ):
         result.write(large, small)
-        report["calibration"] = calibration and calibration.as_dict()
+        report["calibration"] = quality_table and quality_table.as_dict()
         report |= {"adapter_bytes": small.stat().st_size, "ply_bytes": large.stat().st_size}
         write_report(about, report)
     console.say(f"wrote {outputs.adapter} and {outputs.ply}")
@@ -145,7 +145,7 @@ def write_result(run: Run, result: Result) -> Report:
 
 
 def describe(run: Run, result: Result) -> Report:
-    """The report, except the calibration and the sizes of the files."""
+    """The report, except the quality table and the sizes of the files."""
     args, adapted, adapter = run.args, result.adapted, result.adapter
     times, count, device = result.plan.seconds, launched().size, result.gaussians.means.device
     run.watch.seconds |= {

@@ -220,7 +220,7 @@ baking:
   grown scales. This is lossy; keep MODEL. Baking takes each Gaussian's mean
   distance to the training cameras of --images, else to those stored in MODEL,
   else to 16 placed ones. With --camera the file is exact at that camera.
-  --keep is exact. --psnr-drop and --fps use the calibration in MODEL; with
+  --keep is exact. --psnr-drop and --fps use the quality table in MODEL; with
   --images, --fps times frames of MODEL on this machine.
 
 levels and order:

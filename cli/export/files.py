@@ -21,7 +21,6 @@ from clod_adapter import (
     tune,
 )
 from clod_adapter.bake import Level
-from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import spread
 from clod_adapter.harmonics import with_sh_degree
 from clod_adapter.inspection.report import extra_columns
@@ -31,6 +30,7 @@ from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.io.settings import Metadata
 from clod_adapter.losses import psnr
+from clod_adapter.quality_table import Viewpoint
 from clod_adapter.viewer.page import write_viewer_page
 
 from ..shared import inputs
@@ -296,10 +296,10 @@ class Export:
                 self._transform([source], packed, len(gaussians))
                 packed.replace(path)
             return len(gaussians)
-        stored = self.model.calibration if virtual_scale is None else None
+        kept = self.model.quality_table if virtual_scale is None else None
         self.console.note(
             *write(
-                path, gaussians, Metadata(calibration=stored, origin=self.model.origin, about=about)
+                path, gaussians, Metadata(quality_table=kept, origin=self.model.origin, about=about)
             )
         )
         if suffix == ".ply" and any(self.model.origin):

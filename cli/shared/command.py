@@ -90,13 +90,13 @@ BUDGET_OPTIONS: tuple[tuple[str, str, type, str], ...] = (
         "psnr_drop",
         "DB",
         float,
-        "the dial value that loses DB decibels against s = 1, by the calibration",
+        "the dial value that loses DB decibels against s = 1, by the quality table",
     ),
 )
 BUDGETS = """\
 budgets, each solved for a dial value:
   --keep       exact; s = 1 keeps fewer Gaussians than the file has
-  --psnr-drop  from the calibration in the file's header
+  --psnr-drop  from the quality table in the file's header
   --fps        times some frames first; depends on machine, image size and load
 If s = 1 meets the budget, or the largest trained dial value loses less than DB,
 that is the result. A count below the trained range is met with a note; a frame

@@ -17,11 +17,11 @@ from clod_adapter import (
     dial_for,
     evaluate,
 )
-from clod_adapter.calibration import Viewpoint
 from clod_adapter.evaluation.budget import dial_for_times, frame_times
 from clod_adapter.evaluation.calibrate import with_frame_times
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.progress import GracefulStop
+from clod_adapter.quality_table import Viewpoint
 
 from .command import given_budget
 from .console import Console
@@ -154,7 +154,7 @@ def solve_dials(
 
     Args:
         cameras: those that the command renders, or bakes for. Where none of them has an image size,
-            as those stored in a file, frame times are those of the calibration.
+            as those stored in a file, frame times are those of the quality table.
         baked: whether a count is of the file baked for the cameras, and not the mean over them.
     """
     budget = given_budget(args)
@@ -162,7 +162,7 @@ def solve_dials(
         return args.sv
     name, option, values = budget
     renderable = [camera for camera in cameras if isinstance(camera, Camera)]
-    calibration = model.calibration
+    quality_table = model.quality_table
     times, machine = None, ""
     if name == "fps" and renderable:
         prepare_kernels(console, model.gaussians.means.device, training=False)
@@ -174,18 +174,18 @@ def solve_dials(
             *notes,
         )
     elif name != "keep":
-        if calibration is None:
-            why = [note for note in model.notes if "calibration" in note]
-            why.append("there is no calibration in the header")
+        if quality_table is None:
+            why = [note for note in model.notes if "quality table" in note]
+            why.append("there is no quality table in the header")
             raise ClodError(
                 f"{model.path}: {option}: {why[0]}; adapt it again, or give --sv or --keep"
             )
         if name == "fps":
-            size = f"{calibration.width}x{calibration.height}"
-            machine = f" (frame times of {calibration.machine} at {size})"
-        elif calibration.against == "checkpoint":
+            size = f"{quality_table.width}x{quality_table.height}"
+            machine = f" (frame times of {quality_table.machine} at {size})"
+        elif quality_table.against == "checkpoint":
             console.note(
-                "--psnr-drop uses a calibration made without photographs, against renders of the"
+                "--psnr-drop uses a quality table made without photographs, against renders of the"
                 " checkpoint"
             )
     dials = []
@@ -196,7 +196,7 @@ def solve_dials(
             if times:
                 solved = dial_for_times(times, value)
             else:
-                solved = dial_for(model.gaussians, calibration=calibration, **budget_for)
+                solved = dial_for(model.gaussians, quality_table=quality_table, **budget_for)
         except ClodError as error:
             raise ClodError(f"{asked}: {error}{machine}") from error
         dials.append(solved.virtual_scale)

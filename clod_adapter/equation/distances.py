@@ -16,10 +16,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, intrinsics
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.quality_table import Viewpoint
 
 Place = Camera | Viewpoint
 # times the median distance from the scene's centre: one camera that far away must not decide

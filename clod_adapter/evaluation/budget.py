@@ -2,7 +2,7 @@
 
 - A count needs no measurement: from one camera a Gaussian is kept between two dial values, and the
   count is bisected. Exact but for dial values that are equal.
-- PSNR is read from the calibration table that is stored with the file (``calibration.py``).
+- PSNR is read from the quality table that is stored with the file (``quality_table.py``).
 - Frame rates depend on the machine, the image size and the load: frames are timed, from cameras.
   The table's times are used only where they are passed in, or (``clod-adapt export``) where nothing
   can be timed.
@@ -21,7 +21,6 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import number, require
 from clod_adapter.equation.attenuation import dial, kept_between, smallest_dial
@@ -30,6 +29,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener
+from clod_adapter.quality_table import QualityTable, crossing
 
 TIMED_DIALS = 6
 BEYOND = 1e6  # times max_sv, where the search for a count ends
@@ -56,7 +56,7 @@ def dial_for(
     psnr_drop: float | None = None,
     fps: float | None = None,
     cameras: Sequence[Place] = (),
-    calibration: Calibration | None = None,
+    quality_table: QualityTable | None = None,
     baked: bool = False,
 ) -> DialValue:
     """The smallest dial value that meets one budget: the best quality within it.
@@ -64,13 +64,13 @@ def dial_for(
     Args:
         gaussians: with a dial.
         keep: largest number of Gaussians: in the view of one camera, or the mean over several.
-        psnr_drop: dB below the calibration's PSNR at s = 1; gives the largest dial value before
+        psnr_drop: dB below the quality table's PSNR at s = 1; gives the largest dial value before
             PSNR first is lower.
-        fps: frames per second. The times of a calibration are used as they are, whatever machine
-            and image size they are from (``calibration.machine``, ``width``, ``height``); without
+        fps: frames per second. The times of a quality table are used as they are, whatever machine
+            and image size they are from (``quality_table.machine``, ``width``, ``height``); without
             one, ``cameras`` are timed.
         cameras: for ``keep`` and ``fps``; ``fps`` needs whole cameras to render from.
-        calibration: for ``psnr_drop`` and ``fps``; ``load(path).calibration``.
+        quality_table: for ``psnr_drop`` and ``fps``; ``load(path).quality_table``.
         baked: ``keep`` counts the Gaussians that ``bake`` keeps for the cameras.
 
     Raises:
@@ -95,9 +95,9 @@ def dial_for(
     if keep is not None:
         return _for_count(gaussians, cameras, baked, keep)
     if psnr_drop is not None:
-        return _for_psnr_drop(calibration, psnr_drop)
-    if calibration:
-        times = [(row.virtual_scale, row.frame_ms) for row in calibration.rows]
+        return _for_psnr_drop(quality_table, psnr_drop)
+    if quality_table:
+        times = [(row.virtual_scale, row.frame_ms) for row in quality_table.rows]
     else:
         whole = [camera for camera in cameras if isinstance(camera, Camera)]
         times, _ = frame_times(gaussians, whole)
@@ -148,12 +148,10 @@ def frame_times(
     return list(zip(virtual_scales, found.milliseconds[0], strict=True)), found.notes
 
 
-def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
-    if calibration is None:
-        raise ClodError(
-            "a PSNR drop needs the calibration table that adapting stores with the file"
-        )
-    rows = calibration.rows
+def _for_psnr_drop(quality_table: QualityTable | None, drop: float) -> DialValue:
+    if quality_table is None:
+        raise ClodError("a PSNR drop needs the quality table that adapting stores with the file")
+    rows = quality_table.rows
     least = rows[0].psnr - drop
     for row, following in pairwise(rows):
         if following.psnr < least:  # PSNR is linear in log s

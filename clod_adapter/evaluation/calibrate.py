@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from clod_adapter._support.machine import machine_name
-from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.evaluation.evaluate import Row
@@ -14,6 +13,7 @@ from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Listener
+from clod_adapter.quality_table import QualityTable
 
 # Round values, each about 1.4 times the last, or more between 1 and 5.
 REPORT_DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
@@ -48,10 +48,10 @@ def with_frame_times(
     return timed, times.notes
 
 
-def calibrate(
+def make_quality_table(
     rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin
-) -> Calibration:
-    """The calibration of rows measured on this machine.
+) -> QualityTable:
+    """The quality table of rows measured on this machine.
 
     Args:
         against: what the rows compare with: "photographs", or renders of the "checkpoint".
@@ -66,7 +66,7 @@ def calibrate(
     stored = list(spread(scene.train, VIEWPOINTS))
     if against != "photographs":  # of placed cameras some look at little; viewers open at the first
         stored.sort(key=_interest, reverse=True)
-    return Calibration.of(
+    return QualityTable.of(
         rows,
         total=len(measured),
         views=len(scene.test),

@@ -68,7 +68,7 @@ def time_frames(
 ) -> FrameTimes:
     """Times frames from at most three of the cameras, evenly spread."""
     if not cameras:
-        raise ClodError("frames a second need a calibration or cameras to time frames from")
+        raise ClodError("frames a second need a quality table or cameras to time frames from")
     jobs = list[tuple[Gaussians, float]]()
     for model, dials in models:
         model = model.without_empty_bands()

@@ -18,7 +18,7 @@ from clod_adapter.inspection.statistics import FAR, Dial, Splat, values_of
 from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, Head
 from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map
-from clod_adapter.io.settings import Source, matching_calibration, stated_filter
+from clod_adapter.io.settings import Source, matching_quality_table, stated_filter
 from clod_adapter.io.values import (
     FILTER_3D,
     Prepared,
@@ -110,8 +110,8 @@ def _splat_of(source: Source, rows: Prepared, notes: list[str]) -> Splat:
     values = values_of(rows)
     dial = None
     if metadata.attenuation is not None:
-        calibration, mismatch = matching_calibration(metadata, values["count"])
-        dial = Dial(metadata.attenuation, calibration)
+        quality_table, mismatch = matching_quality_table(metadata, values["count"])
+        dial = Dial(metadata.attenuation, quality_table)
         if not metadata.described:
             # here: other files are inspected without torch
             from clod_adapter.io.checkpoint import plausibility

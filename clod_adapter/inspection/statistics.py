@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from clod_adapter.calibration import Calibration
 from clod_adapter.config import AttenuationConfig, ScreenFilter
 from clod_adapter.io.values import GROWTH, SIGMA, Prepared
 from clod_adapter.origin import Origin
+from clod_adapter.quality_table import QualityTable
 
 QUANTILES = (0, 0.01, 0.5, 0.99, 1)
 NEEDLE = 10.0  # a Gaussian this many times as long as its second axis
@@ -45,7 +45,7 @@ class Dial:
     """The settings of a file with a dial."""
 
     attenuation: AttenuationConfig
-    calibration: Calibration | None
+    calibration: QualityTable | None
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     settings = Metadata(
         adapter.attenuation,
         adapter.screen_filter,
-        adapter.calibration,
+        adapter.quality_table,
         adapter.origin,
         version=adapter.version,
     )
@@ -85,7 +85,7 @@ def load_adapter(path: str | Path) -> Adapter:
             base_fingerprint=about["base_sha256"],
             config=about["config"],
             version=settings.version,
-            calibration=settings.calibration,
+            quality_table=settings.quality_table,
             origin=settings.origin,
             screen_filter=settings.screen_filter or CLASSIC,
             notes=settings.notes,

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.cameras import Camera, with_near_planes
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import reach_fade
@@ -26,11 +25,12 @@ from clod_adapter.io.ranks import ranks_of
 from clod_adapter.io.settings import (
     WARNING,
     Metadata,
-    matching_calibration,
+    matching_quality_table,
     stated_filter,
 )
 from clod_adapter.io.values import SIGMA, Activated, Prepared, prepared
 from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.quality_table import QualityTable, Viewpoint
 
 # Adapted files of three captures keep 38 to 97 % at s = 1, with sigma_d in other units 3 to 43 %.
 DOUBTFUL = 0.25
@@ -50,7 +50,7 @@ class Checkpoint:
         fingerprint: SHA-256 of the file's bytes, hex, or of those of all ranks; preceded by
             "opacity:", "scales:" or "both:" where values were taken as activated.
         path: of the file.
-        calibration: what its dial values keep, cost and take, if it stores that.
+        quality_table: what its dial values keep, cost and take, if it stores that.
         origin: ``[3]`` what the means are relative to, world units: not 0 only for a scene far from
             0, whose photographs are to be read relative to it too (``load_scene``). Outputs have
             the file's own coordinates.
@@ -64,7 +64,7 @@ class Checkpoint:
     notes: tuple[str, ...]
     fingerprint: str
     path: Path
-    calibration: Calibration | None = None
+    quality_table: QualityTable | None = None
     origin: Origin = NOWHERE
     filter_known: bool = False
 
@@ -73,19 +73,19 @@ class Checkpoint:
 
     @property
     def viewpoints(self) -> tuple[Viewpoint, ...]:
-        """Viewpoints of the calibration, relative to the origin as the Gaussians are; empty without
-        a calibration.
+        """Viewpoints of the quality table, relative to the origin as the Gaussians are; empty
+        without a quality table.
         """
-        stored = self.calibration.viewpoints if self.calibration else ()
+        stored = self.quality_table.viewpoints if self.quality_table else ()
         back = [-value for value in self.origin]
         return tuple(viewpoint.moved(back) for viewpoint in stored)
 
     @property
     def cameras(self) -> list[Camera]:
-        """The viewpoints as cameras with the size of the calibration's images."""
-        if self.calibration is None:
+        """The viewpoints as cameras with the size of the quality table's images."""
+        if self.quality_table is None:
             return []
-        size = self.calibration.width, self.calibration.height
+        size = self.quality_table.width, self.quality_table.height
         looking = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
         cameras = []
         for number, viewpoint in enumerate(looking, start=1):
@@ -97,7 +97,7 @@ class Checkpoint:
         """Whether these cameras were placed without photographs, so that they do not tell which way
         is up.
         """
-        return self.calibration is not None and self.calibration.against == "checkpoint"
+        return self.quality_table is not None and self.quality_table.against == "checkpoint"
 
     def hook(self, virtual_scale: float = 1.0) -> Hook:
         """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of
@@ -169,7 +169,9 @@ def load(
     notes = [*_notes_of(values, arrays["opacity_logits"]), *metadata.notes]
     if gaussians.attenuation is not None and not metadata.described:
         notes += plausibility(arrays, gaussians.attenuation)
-    calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
+    quality_table, mismatch = (
+        matching_quality_table(metadata, len(gaussians)) if dial else (None, [])
+    )
     about = [
         re.sub("[^\t -~]", "?", line) for line in source.comments if not line.startswith(PREFIX)
     ]
@@ -180,7 +182,7 @@ def load(
         (*notes, *mismatch, *source.notes),
         source.sha256 if values.activated == "none" else f"{values.activated}:{source.sha256}",
         path,
-        calibration,
+        quality_table,
         values.origin,
         filter_known=dial or metadata.screen_filter is not None,
     )
@@ -227,7 +229,7 @@ def save(
     base: Checkpoint | None = None,
     *,
     version: str | None = None,
-    calibration: Calibration | None = None,
+    quality_table: QualityTable | None = None,
 ) -> None:
     """Writes ``gaussians`` in the format of the path's suffix (``file_formats.WRITABLE``).
 
@@ -244,7 +246,7 @@ def save(
     Args:
         version: of the package that made the values, for the header (``Adapter.version``); by
             default the running one.
-        calibration: of these Gaussians, for the header. The base's is not passed on, which is of
+        quality_table: of these Gaussians, for the header. The base's is not passed on, which is of
             the base.
 
     Raises:
@@ -253,7 +255,7 @@ def save(
             again; for another format than PLY also sigma_d that it does not carry.
     """
     path = Path(path)
-    metadata = Metadata(calibration=calibration, version=version or "")
+    metadata = Metadata(quality_table=quality_table, version=version or "")
     rows = None
     if base is not None:
         _check_base(path, gaussians, base)

@@ -18,7 +18,6 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from clod_adapter._support.text import package_version
-from clod_adapter.calibration import CalibrationRow, Viewpoint
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.settings import EARLIER_FORM, FILTER, Metadata, read_metadata, tagged
@@ -32,6 +31,7 @@ from clod_adapter.io.values import (
     dial_columns,
     hidden,
 )
+from clod_adapter.quality_table import QualityRow, Viewpoint
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
@@ -44,8 +44,8 @@ NEAR = "clod_near_distance"
 PAPER = "clod_paper"
 VARIANCE = "clod_screen_variance"
 COMPENSATE = "clod_compensate"
-# Comments of the calibration: machine; total, views, width, height, reference; one for each row and
-# each viewpoint.
+# Comments of the quality table: machine; total, views, width, height, reference; one for each row
+# and each viewpoint.
 MACHINE = "calibrated_on"
 EXTENT = "calibrated_with"
 ROW = "calibrated"
@@ -101,7 +101,7 @@ def write_comments(metadata: Metadata) -> list[str]:
     among the lines.
 
     One comment per setting, as ``clod_adapter reference_distance 3.2``: the shortest decimal that
-    gives the same double. Some readers do not take long comments, so each row of the calibration
+    gives the same double. Some readers do not take long comments, so each row of the quality table
     has its own.
     """
     screen_filter = metadata.screen_filter or CLASSIC
@@ -111,7 +111,7 @@ def write_comments(metadata: Metadata) -> list[str]:
             lines.append(f"{name} {type(usual)(getattr(metadata.attenuation, name))}")
     if screen_filter != CLASSIC:
         lines.append(f"{FILTER} {screen_filter.variance} {screen_filter.compensate}")
-    if (c := metadata.calibration) is not None:
+    if (c := metadata.quality_table) is not None:
         lines.append(f"{MACHINE} {c.machine}")
         lines.append(f"{EXTENT} {c.total} {c.views} {c.width} {c.height} {c.against}")
         lines += [f"{ROW} {' '.join(map(repr, astuple(row)))}" for row in c.rows]
@@ -130,7 +130,7 @@ def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
         if line.startswith(PREFIX):
             name, _, text = line.removeprefix(PREFIX).partition(" ")
             if name == ROW:
-                measured["rows"].append(_by_name(CalibrationRow, text))
+                measured["rows"].append(_by_name(QualityRow, text))
             elif name == VIEWPOINT:
                 measured["viewpoints"].append(_by_name(Viewpoint, text))
             else:

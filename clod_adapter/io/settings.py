@@ -1,12 +1,12 @@
 """Settings that travel with a file: one reader for PLY comments, PLY columns and JSON documents.
 
 Each format gives the same mapping, whose numbers may be text: ``attenuation`` and ``screen_filter``
-to the fields of their classes, ``calibration`` as Calibration.as_dict, ``origin`` to [x, y, z],
+to the fields of their classes, ``calibration`` as QualityTable.as_dict, ``origin`` to [x, y, z],
 ``about`` to lines of text, and ``package_version``.
 
 Formats other than PLY store it as a JSON document under the key ``clod_adapter``
 (``file_formats.KEY``). An unknown field is ignored with a note, a damaged setting is rejected, and
-a damaged calibration, which rendering does not need, is ignored with a note.
+a damaged quality table, which rendering does not need, is ignored with a note.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clod_adapter._support.text import package_version
-from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError, rejected_if_damaged
 from clod_adapter.origin import NOWHERE, Origin, parse_origin
+from clod_adapter.quality_table import QualityTable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -56,8 +56,8 @@ class Metadata:
 
     attenuation: AttenuationConfig | None = None  # None for a file without a sigma_d
     screen_filter: ScreenFilter | None = None  # None where the file does not store one
-    # as stored; ``matching_calibration`` compares it with the Gaussians
-    calibration: Calibration | None = None
+    # as stored; ``matching_quality_table`` compares it with the Gaussians
+    quality_table: QualityTable | None = None
     origin: Origin = NOWHERE  # what the means are relative to, world units
     about: tuple[str, ...] = ()  # lines on the history of the file
     # of the package that made it; "" as read: another program, to be written: the running one
@@ -102,7 +102,7 @@ def read_metadata(
                 else None
             ),
             screen_filter=_screen_filter(values[FILTER], notes) if FILTER in values else None,
-            calibration=_calibration(values.get("calibration"), notes),
+            quality_table=_quality_table(values.get("calibration"), notes),
             origin=parse_origin(values.get("origin", NOWHERE)),
             about=tuple(map(str, values.get("about", ()))),
             version=str(values.get("package_version", "")),
@@ -131,11 +131,11 @@ def _screen_filter(stored: Any, notes: list[str]) -> ScreenFilter:
     return ScreenFilter(variance=float(stored["variance"]), compensate=compensate)
 
 
-def _calibration(stored: Any, notes: list[str]) -> Calibration | None:
+def _quality_table(stored: Any, notes: list[str]) -> QualityTable | None:
     try:
-        return None if stored is None else Calibration.from_dict(stored)
+        return None if stored is None else QualityTable.from_dict(stored)
     except (ClodError, AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
-        notes.append(f"the calibration is unusable and ignored ({error!s:.80})")
+        notes.append(f"the quality table is unusable and ignored ({error!s:.80})")
         return None
 
 
@@ -178,12 +178,14 @@ def of_another_method(names: Iterable[str]) -> list[str]:
     return lines
 
 
-def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | None, list[str]]:
-    """The calibration if it was measured on ``count`` Gaussians; else None and a note."""
-    stored = metadata.calibration
+def matching_quality_table(metadata: Metadata, count: int) -> tuple[QualityTable | None, list[str]]:
+    """The quality table if it was measured on ``count`` Gaussians; else None and a note."""
+    stored = metadata.quality_table
     if stored is None or stored.total == count:
         return stored, []
-    return None, [f"the calibration is of {stored.total} Gaussians and ignored, these are {count}"]
+    return None, [
+        f"the quality table is of {stored.total} Gaussians and ignored, these are {count}"
+    ]
 
 
 def document(kind: str, metadata: Metadata, **further: Any) -> str:
@@ -202,8 +204,8 @@ def document(kind: str, metadata: Metadata, **further: Any) -> str:
         values[FILTER] = asdict(metadata.screen_filter)
     if any(metadata.origin):
         values["origin"] = list(metadata.origin)
-    if metadata.calibration:
-        values["calibration"] = metadata.calibration.as_dict()
+    if metadata.quality_table:
+        values["calibration"] = metadata.quality_table.as_dict()
     if metadata.about:
         values["about"] = list(metadata.about)
     return json.dumps(values | further, sort_keys=True, allow_nan=False)

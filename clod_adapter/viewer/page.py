@@ -27,7 +27,6 @@ from torch import Tensor
 
 from clod_adapter._support.arrays import float64_array
 from clod_adapter._support.text import as_text, script_json
-from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera, looking
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
@@ -38,6 +37,7 @@ from clod_adapter.io.ply_layout import inria_dtype, write_comments
 from clod_adapter.io.settings import Metadata
 from clod_adapter.io.values import dial_columns
 from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.quality_table import QualityTable
 from clod_adapter.rasterizers.reference import rotations
 from clod_adapter.render import render
 
@@ -71,7 +71,7 @@ class Payload:
 
     name: str
     gaussians: Gaussians
-    calibration: Calibration | None = None
+    quality_table: QualityTable | None = None
     origin: Origin = NOWHERE
     about: tuple[str, ...] = ()  # comments on the vertical axis
 
@@ -85,16 +85,16 @@ class Payload:
             )
         about = tuple(filter(VERTICAL.fullmatch, checkpoint.comments))
         name = as_text(checkpoint.path.name)
-        return cls(name, gaussians, checkpoint.calibration, checkpoint.origin, about)
+        return cls(name, gaussians, checkpoint.quality_table, checkpoint.origin, about)
 
     @cached_property
     def header(self) -> bytes:
-        """The PLY's header, with attenuation settings and calibration as comments."""
+        """The PLY's header, with attenuation settings and quality table as comments."""
         g = self.gaussians
         names = inria_dtype(g.sh_degree, dial=dial_columns(g.tensors())).names or ()
         columns = [(name, "<f4") for name in names if name not in ("nx", "ny", "nz")]
         row = np.zeros((), columns)
-        settings = Metadata(g.attenuation, g.screen_filter, self.calibration, about=self.about)
+        settings = Metadata(g.attenuation, g.screen_filter, self.quality_table, about=self.about)
         comments = write_comments(settings)
         element = PlyElement.describe(np.broadcast_to(row, len(g)), "vertex", comments=comments)
         return f"{PlyData([element], byte_order='<').header}\n".encode("ascii")
@@ -139,7 +139,9 @@ class Payload:
             return b"".join(self.blocks()), self.gaussians, ()
         rows = _along_curve(self.gaussians.means)
         try:
-            metadata = Metadata(calibration=self.calibration, origin=self.origin, about=self.about)
+            metadata = Metadata(
+                quality_table=self.quality_table, origin=self.origin, about=self.about
+            )
             notes = write(file, self.gaussians.select(rows), metadata)
             gaussians = load(file, origin=self.origin).gaussians
             gaussians = gaussians.to(self.gaussians.means.device)

@@ -24,8 +24,8 @@ from runs import contents
 
 @pytest.fixture(scope="module")
 def folder(capture, attenuated, tmp_path_factory):
-    """Two scenes, a checkpoint, the files of an adapted one, a dial without calibration, and files
-    of other kinds.
+    """Two scenes, a checkpoint, the files of an adapted one, a dial without quality table, and
+    files of other kinds.
     """
     there = tmp_path_factory.mktemp("work")
     shutil.copytree(capture.scene, there / "scene")
@@ -120,7 +120,7 @@ ERRORS = [
     ("eval base.ply --images scene --sv=-0.5 --json", "--sv has -0.5, it must be at least 0"),
     (
         "eval bare.ply --images scene --psnr-drop 1",
-        "bare.ply: --psnr-drop: there is no calibration .*; adapt it",
+        "bare.ply: --psnr-drop: there is no quality table .*; adapt it",
     ),
     (
         "eval dial.ply --images scene --fps 1e7",

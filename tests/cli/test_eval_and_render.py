@@ -86,7 +86,7 @@ def test_base_by_rank_and_popping(clod, capture):
 def test_against_at_matched_counts(clod, capture, attenuated, tmp_path):
     """Files of one name have their folders as labels."""
     # within the dial's reach
-    count = int(sum(row.kept for row in load(attenuated).calibration.rows[::4]) // 2)
+    count = int(sum(row.kept for row in load(attenuated).quality_table.rows[::4]) // 2)
     for name, size in (("a", count), ("b", 300)):
         (tmp_path / name).mkdir()
         capture.write(tmp_path / name / "cloud.ply", capture.gaussians[:size])
@@ -130,7 +130,7 @@ def test_frames_are_timed_together(clod, monkeypatch):
     monkeypatch.setattr(frame_times, "NOISY", 0.2)
     done = clod("BASE --images SCENE --iters 2 --max-sv 4 --out dial.ply --json")
     assert counts == [[300, 540, 300]]
-    stored = load("dial.ply").calibration.rows
+    stored = load("dial.ply").quality_table.rows
     assert [row.frame_ms * row.virtual_scale for row in stored] == pytest.approx([2000] * 5)
     assert done.report["base_rows"][0]["frame_ms"] == 1000
     assert done.report["base_rows"][0]["frame_ms_range"] == 500
@@ -147,7 +147,7 @@ def test_eval_at_a_budget(clod, attenuated):
     """Within the range, at s = 1 if that is enough; a psnr drop out of reach gives the range's end;
     with notes.
     """
-    rows = load(attenuated).calibration.rows
+    rows = load(attenuated).quality_table.rows
     middle = round(rows[0].kept * 0.4 + rows[-1].kept * 0.6)
     report = clod(EVAL, "--keep", middle, 300).report
     solved, whole = report["rows"]
@@ -173,10 +173,10 @@ def test_eval_at_a_budget(clod, attenuated):
 
 def test_baking_to_a_budget(clod, attenuated):
     model = load(attenuated)
-    table = model.calibration
+    table = model.quality_table
     rows = tuple(replace(row, frame_ms=8 / row.virtual_scale) for row in table.rows)
     elsewhere = replace(table, rows=rows, machine="another", width=640, height=480)
-    save("there.ply", model.gaussians, model, calibration=elsewhere)
+    save("there.ply", model.gaussians, model, quality_table=elsewhere)
     report = clod("export there.ply --fps 250 -o f.ply --json").report
     assert report["outputs"][0]["virtual_scale"] == pytest.approx(2)
     assert report["notes"] == ["--fps 250: s = 2 (frame times of another at 640x480)"]

@@ -203,7 +203,7 @@ def test_formats(clod, attenuated, suffix):
     assert again.gaussians.sigma_d is not None and again.gaussians.growth_d is not None
     if suffix == ".ply":
         assert again.gaussians == model.gaussians and again.notes == ()
-        assert again.calibration == model.calibration
+        assert again.quality_table == model.quality_table
     assert "lossy" in clod(EXPORT, f"--sv 2 -o baked{suffix}").err
     clod(f"export baked{suffix} -o again.ply")
     header = Path("again.ply").read_bytes().partition(b"end_header")[0].decode()
@@ -226,9 +226,11 @@ def test_losses_are_noted(clod, attenuated):
     assert load("x.ply").vertex.dtype == model.vertex.dtype
     far = element.data.astype([(n, "f8" if n in "xyz" else t) for n, t in element.data.dtype.descr])
     far["x"] += 437_000.0
-    there = tuple(viewpoint.moved([437_000.0, 0, 0]) for viewpoint in model.calibration.viewpoints)
-    calibration = replace(model.calibration, viewpoints=there)
-    settings = Metadata(model.gaussians.attenuation, calibration=calibration)
+    there = tuple(
+        viewpoint.moved([437_000.0, 0, 0]) for viewpoint in model.quality_table.viewpoints
+    )
+    quality_table = replace(model.quality_table, viewpoints=there)
+    settings = Metadata(model.gaussians.attenuation, quality_table=quality_table)
     write_rows(Path("far.ply"), far, comments=write_comments(settings))
     assert clod("export far.ply --sv 2 -o x.ply --json").note("x, y and z are doubles")
     again = load("x.ply")
@@ -340,7 +342,7 @@ def test_page_holds_the_splat_and_its_dial(clod, attenuated, tmp_path):
     assert [camera["name"] for camera in config["cameras"]] == [f"{k:03}.png" for k in range(10)]
     assert held.gaussians.whole == done.output["count"] == 300
     assert done.output["bytes"] == Path("page.html").stat().st_size
-    assert held.gaussians.sigma_d is not None and held.calibration is not None
+    assert held.gaussians.sigma_d is not None and held.quality_table is not None
     said = re.search(r"PSNR of (\S+) dB against the exact file \(s = 1\)", done.err)
     assert said and float(said[1]) > 40 and [*tmp_path.glob(".tmp-*")] == []
     done, _, held = page("--exact", name="held.ply")

@@ -174,7 +174,7 @@ def test_interrupts_of_the_measurement(clod, words, tmp_path, monkeypatch):
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2]
     assert "measurements were interrupted" in report["notes"][0] in done.err
     assert report["interrupted"] is False and report["calibration"] is None
-    assert load("dial.ply").calibration is None and names(tmp_path) == BOTH
+    assert load("dial.ply").quality_table is None and names(tmp_path) == BOTH
     with pressed(*SAVING, INT):
         done = clod(*words, code=130)
     assert "Ctrl-C again aborts without writing" in done.err and "interrupted after" in done.err

@@ -53,7 +53,7 @@ def test_the_command_a_cell_and_python_train_the_same(clod, capture, monkeypatch
         assert clod_adapter.load_adapter(written).apply(base.gaussians) == result.gaussians
     result.save("python.ply")
     assert results(Path(), "python") == results(Path())
-    assert load("python.ply").calibration.rows[0].psnr == result.rows[0].psnr
+    assert load("python.ply").quality_table.rows[0].psnr == result.rows[0].psnr
 
 
 @pytest.mark.usefixtures("few_placed")

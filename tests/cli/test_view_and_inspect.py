@@ -119,7 +119,7 @@ def test_a_plain_file_fits_on_a_screen(clod, capture):
     assert len({len(line) for line in table}) == 1
 
 
-def test_a_dial_and_its_calibration(clod, attenuated):
+def test_a_dial_and_its_quality_table(clod, attenuated):
     text = clod("inspect DIAL").out
     report = clod("inspect DIAL --json").report
     lines = text.splitlines()

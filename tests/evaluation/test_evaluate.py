@@ -15,12 +15,12 @@ from refusals import refused
 
 from clod_adapter import AttenuationConfig, Stopped, View, dial_for, evaluate, render
 from clod_adapter.adapter import with_dial
-from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.evaluation import frame_times
 from clod_adapter.evaluation.frame_times import PASSES, VIEWS, time_frames
 from clod_adapter.losses import psnr_ssim
+from clod_adapter.quality_table import QualityRow, QualityTable
 from runs import counted
 from scenes import camera, gaussians, in_front, photograph, ring, seeded
 
@@ -193,9 +193,9 @@ def table(psnr, times=()):
     dials = [2.0**k for k in range(len(psnr))]
     times = times or [10.0 / s for s in dials]
     rows = tuple(
-        CalibrationRow(s, 100 / s, p, 0.9, t) for s, p, t in zip(dials, psnr, times, strict=True)
+        QualityRow(s, 100 / s, p, 0.9, t) for s, p, t in zip(dials, psnr, times, strict=True)
     )
-    return Calibration(rows, 100, 2, 64, 48, "a machine")
+    return QualityTable(rows, 100, 2, 64, 48, "a machine")
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_a_psnr_drop_is_linear_in_log_s(psnr, drop, wanted):
     """From s = 1, not from the best; where it is first spent; a larger one than any is the largest
     dial value.
     """
-    solved = dial_for(adapted(3, 0), psnr_drop=drop, calibration=table(psnr))
+    solved = dial_for(adapted(3, 0), psnr_drop=drop, quality_table=table(psnr))
     assert solved.virtual_scale == pytest.approx(wanted, rel=1e-12)
     assert drop < 3 or solved.note.startswith("only 1.75 dB are lost at s = 4")
 
@@ -224,12 +224,12 @@ def test_a_frame_rate_is_reached_for_good():
         ([20, 10, 5], 200, 4),
         ([20, 10, 5], 30, 1),  # s = 1 is fast enough
     ):
-        calibration = table([30] * len(times), times)
-        solved = dial_for(adapted(3, 0), fps=fps, calibration=calibration)
+        quality_table = table([30] * len(times), times)
+        solved = dial_for(adapted(3, 0), fps=fps, quality_table=quality_table)
         assert solved.virtual_scale == pytest.approx(wanted, rel=1e-12)
         assert solved.note == ("s = 1 draws 50 frames a second already" if fps == 30 else "")
         with refused("at s = [48], .* takes 5.0 ms, 200 a second"):
-            dial_for(adapted(3, 0), fps=201, calibration=calibration)
+            dial_for(adapted(3, 0), fps=201, quality_table=quality_table)
 
 
 def test_bad_arguments_are_refused():
@@ -244,14 +244,14 @@ def test_bad_arguments_are_refused():
         ({"keep": 0}, "keep is 0, it must be a positive, finite number"),
         ({"fps": math.nan}, "fps is nan"),
         ({"psnr_drop": math.inf}, "psnr_drop is inf"),
-        ({"psnr_drop": 1}, "needs the calibration"),
+        ({"psnr_drop": 1}, "needs the quality table"),
         *(
             ({"keep": wrong}, re.escape(f"keep is {wrong}, it must be a positive, finite number"))
             for wrong in ("5", [1.0], torch.ones(2), 10**400)
         ),
         *(({"keep": 3, "cameras": wrong}, lists) for wrong in (camera, [view], "abc", 5)),
         ({"keep": 1, "cameras": ()}, "no camera"),
-        ({"fps": 1, "cameras": ()}, "a calibration or cam"),
+        ({"fps": 1, "cameras": ()}, "a quality table or cam"),
     ):
         with refused(message):
             dial_for(model, **{"cameras": cameras} | arguments)

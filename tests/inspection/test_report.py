@@ -17,8 +17,8 @@ from clod_adapter.inspection.report import inspect, looks_like
 from clod_adapter.io.ply import read_head
 from clod_adapter.origin import NOWHERE
 from formats import (
-    CALIBRATION,
     PACKED,
+    QUALITY_TABLE,
     inria_rows,
     splat_transform,
     with_columns,
@@ -173,9 +173,9 @@ def test_a_packed_file():
 
 def test_a_dial(seen_rows, tmp_path):
     g = with_dial(gaussians(40, 1, 0), attenuation=ATTENUATION, growth_d=torch.linspace(-1, 3, 40))
-    save(tmp_path / "dial.ply", g, calibration=CALIBRATION)
+    save(tmp_path / "dial.ply", g, quality_table=QUALITY_TABLE)
     found, splat = seen(tmp_path / "dial.ply")
-    assert splat.dial.calibration == CALIBRATION and splat.dial.attenuation == ATTENUATION
+    assert splat.dial.calibration == QUALITY_TABLE and splat.dial.attenuation == ATTENUATION
     assert found.what == "an adapted splat, with sigma_d and growth_d, PLY"
     assert "clod-adapter" in found.writer
     assert splat.sigma.least > 0 and splat.comments == splat.extra == ()

@@ -22,9 +22,9 @@ from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import NOWHERE
 from formats import (
     ATTENUATION,
-    CALIBRATION,
     ORIGIN,
     PACKED,
+    QUALITY_TABLE,
     damaged,
     examples,
     model,
@@ -64,7 +64,7 @@ def any_file(folder, kind):
     if kind == ".adapter.safetensors":
         save_adapter(path, extract(detach(g), g, fingerprint="ab", config={"steps": 3}))
         return path
-    write(path, g, Metadata(calibration=CALIBRATION if g.sigma_d is not None else None))
+    write(path, g, Metadata(quality_table=QUALITY_TABLE if g.sigma_d is not None else None))
     if kind in (".ascii.ply", ".big.ply"):
         write_elements(
             path,
@@ -120,14 +120,14 @@ def test_dial_round_trips(tmp_path, suffix, turn, far, growth):
     degree = (WRITABLE.index(suffix) + turn) % 4
     g, origin = model(degree, growth=growth), ORIGIN if far else NOWHERE
     path = tmp_path / f"a{suffix.upper()}"
-    write(path, g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
+    write(path, g, Metadata(quality_table=QUALITY_TABLE, origin=origin, about=ABOUT))
     check_readable(path)
     assert file_has_dial(path)
     found = load(path, origin=origin if suffix == ".ply" else None)  # which a PLY does not store
     same(suffix, g, found.gaussians)
-    assert (found.gaussians.attenuation, found.calibration, found.origin) == (
+    assert (found.gaussians.attenuation, found.quality_table, found.origin) == (
         ATTENUATION,
-        CALIBRATION,
+        QUALITY_TABLE,
         origin,
     )
     assert found.filter_known and all(line in found.comments for line in ABOUT)
@@ -137,16 +137,20 @@ def test_dial_round_trips(tmp_path, suffix, turn, far, growth):
         any("far from 0: read relative to (510000, -4096, 0.25)" in note for note in found.notes)
         == far
     )
-    write(tmp_path / f"b{suffix}", g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
+    write(
+        tmp_path / f"b{suffix}",
+        g,
+        Metadata(quality_table=QUALITY_TABLE, origin=origin, about=ABOUT),
+    )
     assert path.read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
     seen = inspect(path)
-    assert seen.splat.dial.calibration == CALIBRATION
+    assert seen.splat.dial.calibration == QUALITY_TABLE
     assert seen.splat.dial_columns == "sigma_d" + growth * " and growth_d"
-    save(tmp_path / "out.ply", found.gaussians, found, calibration=found.calibration)
+    save(tmp_path / "out.ply", found.gaussians, found, quality_table=found.quality_table)
     again = load(tmp_path / "out.ply", origin=found.origin)
     for name, tensor in again.gaussians.tensors().items():
         assert torch.equal(tensor, getattr(found.gaussians, name)), name
-    assert (again.gaussians.attenuation, again.calibration) == (ATTENUATION, CALIBRATION)
+    assert (again.gaussians.attenuation, again.quality_table) == (ATTENUATION, QUALITY_TABLE)
 
 
 @pytest.mark.parametrize("suffix", WRITABLE)

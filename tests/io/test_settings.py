@@ -16,7 +16,6 @@ from refusals import refused
 from safetensors.torch import load_file, save_file
 
 from clod_adapter.adapter import detach, extract, with_dial
-from clod_adapter.calibration import Viewpoint
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.units import estimated_distance, in_world_units
 from clod_adapter.inspection.report import inspect
@@ -26,9 +25,10 @@ from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.settings import Metadata
 from clod_adapter.io.tensor_file import read_tensors
+from clod_adapter.quality_table import Viewpoint
 from formats import (
     ATTENUATION,
-    CALIBRATION,
+    QUALITY_TABLE,
     change_setting,
     model,
     needed,
@@ -44,21 +44,26 @@ def written(path, screen_filter=CLASSIC):
     g = model(0).replace(screen_filter=screen_filter)
     if path.name.startswith("adapter"):
         adapter = extract(detach(g), g.replace(growth_d=None), fingerprint="0", config={})
-        save_adapter(path, replace(adapter, calibration=CALIBRATION))
+        save_adapter(path, replace(adapter, quality_table=QUALITY_TABLE))
     else:
-        write(path, g, Metadata(calibration=CALIBRATION))
+        write(path, g, Metadata(quality_table=QUALITY_TABLE))
     return path
 
 
 def read(path):
     if path.name.startswith("adapter"):
         adapter = load_adapter(path)
-        return adapter.attenuation, adapter.screen_filter, adapter.calibration, list(adapter.notes)
+        return (
+            adapter.attenuation,
+            adapter.screen_filter,
+            adapter.quality_table,
+            list(adapter.notes),
+        )
     base = load(path)
     notes = [
         note for note in base.notes if "opacity = +inf" not in note and "quantised" not in note
     ]
-    return base.gaussians.attenuation, base.gaussians.screen_filter, base.calibration, notes
+    return base.gaussians.attenuation, base.gaussians.screen_filter, base.quality_table, notes
 
 
 @pytest.mark.parametrize("kind", ["a.ply", "a.glb", "a.spz", "a.pt", "adapter.safetensors"])
@@ -70,7 +75,7 @@ def test_every_format_uses_the_reader(tmp_path, kind):
 
     other = ScreenFilter(variance=0.123456789, compensate=True)
     for screen_filter in (CLASSIC, other):
-        assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, CALIBRATION, [])
+        assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, QUALITY_TABLE, [])
     damage = f"{kind}: its settings are damaged .*{{}}.*; restore them, or export"
     with refused(damage.format("compensate is .*, it must be true or false")):
         change = ("0.123456789", "True", "Yess") if ply else ("compensate", "true", "7e+2")
@@ -79,7 +84,7 @@ def test_every_format_uses_the_reader(tmp_path, kind):
         changed("reference_distance", "3.217", "-3.21")
     notes = ["settings unknown to this version ignored: 'max_sx'"]
     notes += ["settings that are missing have their defaults: max_sv"]
-    wanted = replace(ATTENUATION, max_sv=5.0), CLASSIC, CALIBRATION, notes
+    wanted = replace(ATTENUATION, max_sv=5.0), CLASSIC, QUALITY_TABLE, notes
     assert changed("", "max_sv", "max_sx") == wanted
     total = "calibrated_with" if ply else "total"
     *settings, (note,) = changed(total, "40", "-4")
@@ -88,7 +93,7 @@ def test_every_format_uses_the_reader(tmp_path, kind):
     if not adapter:
         *settings, (note,) = changed(total, "40", "41")
         assert settings[2] is None
-        assert note == "the calibration is of 41 Gaussians and ignored, these are 40"
+        assert note == "the quality table is of 41 Gaussians and ignored, these are 40"
     if not ply:
         with refused(f"{kind}: its format 9 is too new.*upgrade"):
             changed("format_version", "3" if adapter else "1", "9")
@@ -126,18 +131,20 @@ def test_damaged_settings_are_refused(tmp_path):
         ("calibrated 1 ", f"calibrated {'9' * 310} "),
     ],
 )
-def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path, old, new):
+def test_a_quality_table_of_absurd_numbers_is_ignored(tmp_path, old, new):
     """A note says so; nothing is rendered in its size."""
     places = (Viewpoint(1, 0, -5, 1, 0, 0, 1, 0, -1, 0, 0.7),)
     write(
-        tmp_path / "a.ply", model(0), Metadata(calibration=replace(CALIBRATION, viewpoints=places))
+        tmp_path / "a.ply",
+        model(0),
+        Metadata(quality_table=replace(QUALITY_TABLE, viewpoints=places)),
     )
     data = (tmp_path / "a.ply").read_bytes()
     assert data.count(old.encode()) == 1
     (tmp_path / "a.ply").write_bytes(data.replace(old.encode(), new.encode()))
     found = load(tmp_path / "a.ply")
-    assert found.calibration is None
-    assert any("calibration is unusable and ignored" in note for note in found.notes)
+    assert found.quality_table is None
+    assert any("quality table is unusable and ignored" in note for note in found.notes)
 
 
 def with_a_cut(path):

@@ -14,7 +14,7 @@ import torch
 import clod_adapter
 import scenes
 from clod_adapter import load
-from clod_adapter.calibration import Calibration, CalibrationRow
+from clod_adapter.quality_table import QualityRow, QualityTable
 from clod_adapter.render import render
 from clod_adapter.viewer import page
 from runs import data_in
@@ -110,8 +110,8 @@ def test_a_page_of_one_file(show, save, monkeypatch, exact):
         attenuation=replace(model.attenuation, reference_distance=3 * size),
     )
     path = save(far)
-    row = CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
-    calibrated = replace(load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine"))
+    row = QualityRow(1.0, 900.0, 31.5, 0.9, 4.0)
+    calibrated = replace(load(path), quality_table=QualityTable((row,), 1000, 2, 8, 6, "a machine"))
     calibrated.gaussians.opacity_logits[3] = torch.inf
     camera = scenes.camera(320, 240)
     viewmat = camera.viewmat.clone()

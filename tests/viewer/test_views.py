@@ -16,10 +16,10 @@ from skimage.metrics import peak_signal_noise_ratio
 
 import clod_adapter
 import scenes
-from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cameras import Camera
 from clod_adapter.equation.distances import camera_of, viewpoint_of
 from clod_adapter.io.file_formats import write
+from clod_adapter.quality_table import QualityRow, QualityTable
 from clod_adapter.render import render
 from clod_adapter.viewer.page import up_axis, write_viewer_page
 from models import write_model
@@ -342,10 +342,10 @@ def test_placed_cameras_are_levelled(show, model, tmp_path):
         viewmat[[1, 0, 2, 3]] * torch.tensor([[-1.0], [1], [1], [1]]), torch.eye(3), 4, 3
     )
     place = viewpoint_of(tilted, saved.gaussians.means, saved.gaussians.attenuation)
-    measured = Calibration(
-        (CalibrationRow(1.0, 9.0, 30.0, 0.9, 1.0),), 400, 1, 400, 300, "a", "checkpoint", (place,)
+    measured = QualityTable(
+        (QualityRow(1.0, 9.0, 30.0, 0.9, 1.0),), 400, 1, 400, 300, "a", "checkpoint", (place,)
     )
-    write_viewer_page(tmp_path / "page.html", replace(saved, calibration=measured))
+    write_viewer_page(tmp_path / "page.html", replace(saved, quality_table=measured))
     poster = re.findall('jpeg;base64,([^"]*)', (tmp_path / "page.html").read_text("utf-8"))
     level = replace(camera_of(place, 400, 300, ""), viewmat=viewmat)
     wanted = render(saved.gaussians, level, 0.0).pixels.numpy()

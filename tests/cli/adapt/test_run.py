@@ -81,8 +81,8 @@ def test_writes_three_files(adapted, capture, attenuated):
     for entry, row in zip(reported, measured, strict=True):
         assert entry.pop("frame_ms_range") > 0
         assert {**entry, "frame_ms": 0} == {**row.as_dict(), "frame_ms": 0}
-    stored = model.calibration
-    assert stored == load_adapter(folder / "dial.safetensors").calibration
+    stored = model.quality_table
+    assert stored == load_adapter(folder / "dial.safetensors").quality_table
     assert stored.as_dict() == report["calibration"] and stored.machine == machine_name()
     for row, measured in zip(stored.rows, report["rows"], strict=True):
         assert vars(row).items() <= measured.items()

@@ -1,4 +1,4 @@
-"""The calibration table of a file, stored in it, with cameras by which a dial value is baked
+"""The quality table of a file, stored in it, with cameras by which a dial value is baked
 without photographs.
 """
 
@@ -21,7 +21,7 @@ PIXELS = 1 << 26  # of an image: a page renders images of this size
 
 
 @dataclass(frozen=True)
-class CalibrationRow:
+class QualityRow:
     """Means over the held-out views: Gaussians kept, PSNR in dB and SSIM, and the median
     milliseconds of a frame.
     """
@@ -80,7 +80,7 @@ class Viewpoint:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class QualityTable:
     """Count, quality and frame time at ascending dial values, the first s = 1, and how they were
     measured.
 
@@ -99,7 +99,7 @@ class Calibration:
         ClodError: a field is out of range, or dial values do not ascend from 1.
     """
 
-    rows: tuple[CalibrationRow, ...]
+    rows: tuple[QualityRow, ...]
     total: int
     views: int
     width: int
@@ -112,18 +112,18 @@ class Calibration:
         object.__setattr__(self, "viewpoints", tuple(self.viewpoints))
         dials = [row.virtual_scale for row in self.rows]
         if dials[:1] != [1] or dials != sorted(set(dials)):
-            raise ClodError(f"calibration has dial values {dials}, they must ascend from 1")
+            raise ClodError(f"quality table has dial values {dials}, they must ascend from 1")
         for row in self.rows:
             if not all(map(math.isfinite, astuple(row))) or row.frame_ms <= 0:
-                raise ClodError(f"calibration has a value out of range: {row}")
+                raise ClodError(f"quality table has a value out of range: {row}")
         counts = (self.total, self.views, self.width, self.height)
         entries = len(self.rows) + len(self.viewpoints)
         sound = min(counts) >= 1 and max(counts) <= LARGEST
         if not sound or self.width * self.height > PIXELS or entries > MOST_ENTRIES:
-            raise ClodError(f"calibration has a count or size out of range: {(*counts, entries)}")
+            raise ClodError(f"quality table has a count or size out of range: {(*counts, entries)}")
         if not self.machine.isascii() or self.machine != _plain(self.machine) or not self.machine:
             raise ClodError(
-                f"the machine of a calibration is {self.machine!r}, it must be one line of"
+                f"the machine of a quality table is {self.machine!r}, it must be one line of"
                 " printable ASCII"
             )
         known = ", ".join(AGAINST)
@@ -132,7 +132,7 @@ class Calibration:
     @classmethod
     def of(
         cls, rows: Iterable[Any], *, size: tuple[int, int], machine: str, **others: Any
-    ) -> Calibration:
+    ) -> QualityTable:
         """The table of an evaluation's rows (``evaluate.Row``) for images of ``size`` (width,
         height).
 
@@ -140,18 +140,18 @@ class Calibration:
         """
         by_dial = {}
         for row in sorted(rows, key=lambda row: row.virtual_scale):
-            values = {each.name: float(getattr(row, each.name)) for each in fields(CalibrationRow)}
-            by_dial[row.virtual_scale] = CalibrationRow(**values)
+            values = {each.name: float(getattr(row, each.name)) for each in fields(QualityRow)}
+            by_dial[row.virtual_scale] = QualityRow(**values)
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
         width, height = size
         return cls(tuple(by_dial.values()), width=width, height=height, machine=name, **others)
 
     @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Calibration:
+    def from_dict(cls, values: dict[str, Any]) -> QualityTable:
         """The inverse of ``as_dict``; ClodError, KeyError, TypeError or ValueError where it is
         none.
         """
-        rows = tuple(CalibrationRow(**_floats(row)) for row in values["rows"])
+        rows = tuple(QualityRow(**_floats(row)) for row in values["rows"])
         counts = {name: int(values[name]) for name in ("total", "views", "width", "height")}
         # files of earlier versions have no such key
         against = str(values.get("against", AGAINST[0]))
