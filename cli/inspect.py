@@ -97,10 +97,10 @@ def spread_table(rows: Sequence[tuple[str, Spread | None]]) -> list[str]:
 def quality_lines(quality_table: QualityTable | None) -> list[str]:
     """The quality table of the file."""
     if quality_table is None:
-        return [_line("quality table", "none, so --fps and --psnr-drop cannot be solved from it")]
+        return [_line("quality", "none, so --fps and --psnr-drop cannot be solved from it")]
     c = quality_table
     about = f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}"
-    lines = [_line("quality table", about)]
+    lines = [_line("quality", about)]
     lines.append(_line("", f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}"))
     numbers = "{:>6.3g}{:>12,.0f}{:>9.2f}{:>8.3f}{:>10.1f}"
     return lines + [_line("", numbers.format(*astuple(row))) for row in c.rows]
