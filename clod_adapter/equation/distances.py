@@ -93,9 +93,9 @@ def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Vi
     units.
     """
     position = camera.position.to(means)
-    distances = (means - position).norm(dim=1)
     unit = config.scene_distance
     if config.form == "paper":
+        distances = (means - position).norm(dim=1)
         unit = float(normalizing_distance(distances, means, camera, config))
     look = camera.viewmat[2, :3].tolist()
     up = (-camera.viewmat[1, :3]).tolist()

@@ -84,7 +84,7 @@ def file_has_dial(path: Path) -> bool:
     if form is PLY:
         return bool(_reading("ply.has_dial", path))
     if form.carries_sigma:
-        return read_source(path).metadata.attenuation is not None
+        return _read(path).metadata.attenuation is not None
     check_readable(path)
     return False
 
