@@ -2,8 +2,8 @@
 
     python examples/03_gsplat.py adapted.ply scene/
 
-All held-out cameras are drawn in one call at several dial values; the first one's pictures are
-written. gsplat draws on CUDA devices only; 02_render_the_dial.py does the same without.
+The first held-out camera is drawn at several dial values. gsplat draws on CUDA devices only;
+02_render_the_dial.py does the same without.
 """
 
 import sys
@@ -23,11 +23,7 @@ def main(model: str, folder: str, device: str = "cuda") -> None:
     checkpoint = clod.load(model)
     g = checkpoint.gaussians.to(device)
     scene = clod.load_scene(folder, origin=checkpoint.origin)
-    cameras = [view.camera for view in scene.test or scene.train]
-    width, height = cameras[0].width, cameras[0].height
-    cameras = [camera for camera in cameras if (camera.width, camera.height) == (width, height)]
-    viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device)
-    Ks = torch.stack([camera.K for camera in cameras]).to(device)
+    camera = (scene.test or scene.train)[0].camera
     colors = torch.cat([g.sh0, g.shN], dim=1)
 
     for virtual_scale in DIALS:
@@ -37,10 +33,10 @@ def main(model: str, folder: str, device: str = "cuda") -> None:
             g.scales,
             g.opacities,
             colors,
-            viewmats,
-            Ks,
-            width,
-            height,
+            camera.viewmat[None].to(device),
+            camera.K[None].to(device),
+            camera.width,
+            camera.height,
             sh_degree=g.sh_degree,
             sigma_d=g.sigma_d,
             growth_d=g.growth_d,
@@ -52,8 +48,8 @@ def main(model: str, folder: str, device: str = "cuda") -> None:
             name
         )
         # ids of the file's rows, as far as they are in sight
-        drawn = len(meta["gaussian_ids"]) / len(cameras)
-        print(f"wrote {name}: {drawn:,.0f} of {g.whole:,} Gaussians a camera")
+        drawn = len(meta["gaussian_ids"])
+        print(f"wrote {name}: {drawn:,} of {g.whole:,} Gaussians")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""gsplat's functions with a dial: same arguments plus four, same results.
+"""gsplat's functions with a dial: same arguments plus four, same results but ``meta`` of several
+cameras.
 
 from clod_adapter.integrations import gsplat as clod_gsplat
 colors, alphas, meta = clod_gsplat.rasterization(
@@ -7,10 +8,10 @@ colors, alphas, meta = clod_gsplat.rasterization(
 )
 
 gsplat takes one opacity and scale per Gaussian for all cameras; the dial gives one for each camera.
-So each camera is one call of gsplat, and the results are joined in gsplat's form, including ids,
-order and gradients. (A batch of scenes could share a call, but gsplat 1.5.3's packed projection
-culls all scenes by the opacities of the first.) Culled Gaussians cost no more than Gaussians out of
-view. Nothing is gathered: rows and ids stay those of the caller.
+So each camera is one call of gsplat; the images are stacked as gsplat's, and ``meta`` is a list of
+each camera's. (A batch of scenes could share a call, but gsplat 1.5.3's packed projection culls all
+scenes by the opacities of the first.) Culled Gaussians cost no more than Gaussians out of view.
+Nothing is gathered: rows and ids stay those of the caller.
 
 For gsplat 1.4.0 to 1.6.0: the signatures are those of the installed version, and the four.
 """
@@ -41,7 +42,7 @@ __all__ = [
 ]
 
 DIAL_ARGUMENTS = {"sigma_d": None, "virtual_scale": 1.0, "attenuation": None, "growth_d": None}
-Meta = dict[str, Any]
+Meta = dict[str, Any] | list[dict[str, Any]]  # one for each of several cameras
 Documented = TypeVar("Documented", bound=Callable[..., Any])
 
 
@@ -81,9 +82,8 @@ def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Meta]:
     growth (``covars``, where given, times its square), camera by camera for ``[..., C, 4, 4]``.
     Differentiable in ``sigma_d``, ``growth_d`` and all that gsplat differentiates in; the distances
     are constants, so the dial adds nothing to the gradients of ``means`` and ``viewmats``. ``meta``
-    is gsplat's: ``means2d`` takes ``retain_grad()`` and, with ``absgrad``, has its ``absgrad``, as
-    densification strategies need it. (With several cameras ``means2d`` is a copy, which
-    ``torch.autograd.grad`` and hooks on it do not reach.)
+    of one camera is gsplat's, as densification strategies need it. ``meta`` of several is a list of
+    each camera's, in the order of the images: to densify with several, call once per camera.
 
     Pass a file's ``Gaussians.screen_filter`` as without a dial: ``eps2d`` is its variance, and
     ``rasterize_mode="antialiased"`` its compensation of opacities.
@@ -105,7 +105,8 @@ def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Meta]:
     The others are those of the installed gsplat, by position or by name, with its defaults.
 
     Returns:
-        ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``.
+        ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``, for
+        several cameras a list.
 
     Raises:
         ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds
@@ -151,6 +152,5 @@ def rasterization_2dgs_inria_wrapper(
 
     For several cameras gsplat returns the alphas and the maps of the last one; here they are of
     all.
-    ``means2d`` of ``meta`` is ``[N, 3]`` for one camera and ``[C, N, 3]`` for several.
     """
     raise NotImplementedError

@@ -1,5 +1,5 @@
-"""gsplat's functions with opacities and scales of one dial value: one call for each camera, joined
-in gsplat's form.
+"""gsplat's functions with opacities and scales of one dial value: one call for each camera, whose
+images are stacked as gsplat's.
 
 Which arguments and results there are is read from the installed gsplat. Rows of opacity 0 have to
 be culled before tiles and sorting: where gsplat's projection does not do that, their centres move
@@ -7,11 +7,8 @@ behind the camera.
 """
 
 import math
-import sys
-import weakref
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -37,7 +34,6 @@ PER_CAMERA = (
 )
 # arguments by Gaussian or by view and Gaussian, and the SH degree of each
 PER_EITHER = {"colors": "sh_degree", "extra_signals": "extra_signals_sh_degree"}
-GRADIENTS = ("means2d", "gradient_2dgs")
 
 
 def render(
@@ -143,95 +139,16 @@ def _cameras(arguments: dict[str, Any], shape: torch.Size) -> Iterator[dict[str,
 
 
 def _joined(results: Sequence[Any], shape: torch.Size) -> Any:
-    """gsplat's result for all images from that of each; ``shape`` has batch dimensions and
-    cameras.
+    """gsplat's result for all images from that of each, ``meta`` as a list; ``shape`` has batch
+    dimensions and cameras.
     """
     first = results[0]
     if isinstance(first, tuple):
         return tuple(_joined(same, shape) for same in zip(*results, strict=True))
     if isinstance(first, dict):
-        return _joined_meta(results, shape)
+        return list(results)
     if first is None:
         return None
     each = [result.reshape(result.shape[-3:]) for result in results]
     images = torch.stack(each).unflatten(0, shape)
     return images.squeeze(0) if first.dim() == 3 else images  # as gsplat squeezes some
-
-
-def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str, Any]:
-    """Rows concatenated, ids offset, what is of an image stacked."""
-    first = metas[0]
-    images = range(len(metas))
-    packed = first.get("gaussian_ids") is not None
-    counted: dict[str, Sequence[int]] = {}
-    if "depths" in first:
-        # Width of the tile's number in gsplat's sorting key; gsplat 1.6 has a function for it.
-        bits = getattr(
-            sys.modules.get("gsplat.cuda._torch_impl"), "_bits_for_count", int.bit_length
-        )
-        tile_bits = int(bits(first["tile_width"] * first["tile_height"]))
-        counted = {
-            "batch_ids": [image // shape[-1] for image in images],
-            "camera_ids": [image % shape[-1] for image in images],
-            "flatten_ids": [0, *accumulate(meta["depths"].numel() for meta in metas)],
-            "isect_offsets": [0, *accumulate(len(meta["isect_ids"]) for meta in metas)],
-            # image, tile, depth: gsplat's sorting key
-            "isect_ids": [image << 32 + tile_bits for image in images],
-        }
-    counts = {"n_batches": math.prod(shape[:-1]), "n_cameras": shape[-1]}
-    joined = first | {name: count for name, count in counts.items() if name in first}
-    for name, value in first.items():
-        if isinstance(value, Tensor):
-            values = [meta[name] for meta in metas]
-            if name in counted:
-                values = [ids + start for ids, start in zip(values, counted[name], strict=False)]
-            of_images = name == "isect_offsets" or value.dim() == 4
-            # means2d of the Inria wrappers has none
-            without_camera = name == "means2d" and value.dim() == 2 and not packed
-            joined[name] = (torch.stack if without_camera else torch.cat)(values)
-            if of_images or not (packed or name in counted):
-                joined[name] = joined[name].unflatten(0, shape)
-    for name in set(GRADIENTS) & set(first):
-        _pass_gradients_on([meta[name] for meta in metas], joined[name])
-    return joined
-
-
-def _pass_gradients_on(inputs: list[Tensor], joint: Tensor) -> None:
-    """Gives ``joint`` the ``grad`` and ``absgrad`` of the ``inputs``, which gsplat rendered from.
-
-    As with gsplat: ``grad`` if it is retained, as a leaf's always is, summed over backward passes;
-    ``absgrad`` of the last one.
-    """
-    if not joint.requires_grad:
-        return
-    if all(piece.is_leaf for piece in inputs):
-        joint.retain_grad()
-    joint.inputs = inputs  # type: ignore[attr-defined]
-    # the graph of joint holds the hooks; a strong reference would be a cycle
-    weak: Any = weakref.ref(joint)
-    values = joint.shape[-1]
-    rows = [0, *accumulate(piece.numel() // values for piece in inputs)]
-    # gradients that came through joint and are in its grad already
-    joint_gradients: list[Any] = [0] * len(inputs)
-
-    def on_joint_gradient(gradient: Tensor) -> None:
-        joint_gradients[:] = gradient.reshape(-1, values).split(
-            [stop - start for start, stop in pairwise(rows)]
-        )
-
-    def on_input_gradient(gradient: Tensor, number: int) -> None:
-        own_gradient = gradient.reshape(-1, values) - joint_gradients[number]
-        joint_gradients[number] = 0
-        if (joint := weak()) is None:
-            return
-        place = slice(rows[number], rows[number + 1])
-        if joint.retains_grad:
-            joint.grad = torch.zeros_like(joint) if joint.grad is None else joint.grad.clone()
-            joint.grad.view(-1, values)[place] += own_gradient
-        if hasattr(joint.inputs[number], "absgrad"):
-            joint.absgrad = getattr(joint, "absgrad", torch.zeros_like(joint))
-            joint.absgrad.view(-1, values)[place] = joint.inputs[number].absgrad.view(-1, values)
-
-    joint.register_hook(on_joint_gradient)
-    for number, piece in enumerate(inputs):
-        piece.register_hook(partial(on_input_gradient, number=number))

@@ -1,8 +1,6 @@
 """The wrappers against stand-ins with the signatures of gsplat 1.4.0 to 1.6.0."""
 
 import inspect
-import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -119,33 +117,17 @@ def test_a_camera_is_a_call_with_its_part_of_every_argument(monkeypatch, version
             assert torch.equal(gsplat.calls[-1]["rays"], ray)
 
 
-def test_meta_of_other_functions_and_versions_is_joined(monkeypatch):
-    """gsplat 1.6 has a width of its own for the tile's number in the sorting key."""
+def test_meta_of_several_cameras_is_a_list(monkeypatch):
     gsplat = Gsplat(monkeypatch, "1.6.0")
-    gsplat.meta = {
-        "radii": torch.ones(1, N),
-        "means2d": torch.zeros(N, 3),
-        "n_cameras": 1,
-        "gaussian_ids": None,
-    }
-    sigma_d = torch.ones(N)
-    given = gsplat.arguments("rasterization_2dgs_inria_wrapper")
-    meta = gsplat.ours.rasterization_2dgs_inria_wrapper(**given, sigma_d=sigma_d, packed=True)[1]
-    assert meta["radii"].shape == (CAMERAS, N) and meta["means2d"].shape == (CAMERAS, N, 3)
-    assert meta["n_cameras"] == CAMERAS and gsplat.calls[0]["kwargs"] == {"packed": True}
-    gsplat.meta = {
-        "depths": torch.ones(1, N),
-        "tile_width": 2,
-        "tile_height": 2,
-        "isect_ids": torch.tensor([7]),
-    }
-    for torch_code, bits in (
-        (None, 3),
-        (SimpleNamespace(_bits_for_count=lambda count: (count - 1).bit_length()), 2),
-    ):
-        monkeypatch.setitem(sys.modules, "gsplat.cuda._torch_impl", torch_code)
-        meta = gsplat.ours.rasterization(**gsplat.arguments("rasterization"), sigma_d=sigma_d)[2]
-        assert meta["isect_ids"].tolist() == [7 + (image << 32 + bits) for image in range(CAMERAS)]
+    for name in ("rasterization", "rasterization_2dgs", "rasterization_2dgs_inria_wrapper"):
+        for cameras in (1, CAMERAS):
+            given = gsplat.arguments(name, cameras=cameras)
+            meta = getattr(gsplat.ours, name)(**given, sigma_d=torch.ones(N), packed=True)[-1]
+            if cameras == 1:
+                assert meta is gsplat.meta
+            else:
+                assert [id(each) for each in meta] == CAMERAS * [id(gsplat.meta)]
+    assert gsplat.calls[-1]["kwargs"] == {"packed": True}
 
 
 @pytest.mark.parametrize(
