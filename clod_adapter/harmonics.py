@@ -11,7 +11,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.reference import sh_basis
 
 RIDGE = 0.01  # of a view: holds coefficients that the views leave open at those that are stored
-ROWS = 1 << 15  # Gaussians that are fitted at a time
+PAIRS = 1 << 17  # Gaussians times places that are fitted at a time
 
 
 @torch.no_grad()
@@ -28,7 +28,7 @@ def with_sh_degree(gaussians: Gaussians, sh_degree: int, places: Sequence[Place]
         places: cameras, or viewpoints; as many as possible, from where the result is to be seen.
 
     Raises:
-        ClodError: ``sh_degree`` is none of 0 to 3.
+        ClodError: ``sh_degree`` is none of 0 to 3, or there is no place.
 
     Example:
         >>> small = with_sh_degree(model.gaussians, 1, model.viewpoints)
@@ -38,29 +38,24 @@ def with_sh_degree(gaussians: Gaussians, sh_degree: int, places: Sequence[Place]
     )
     if gaussians.sh_degree <= sh_degree:
         return gaussians
+    require(len(places) > 0, "the number of places", len(places), "at least 1")
     kept = SH_COUNTS[sh_degree]
-    changes = [
-        _fitted(gaussians.means[rows], gaussians.shN[rows], kept, places)
-        for rows in torch.arange(len(gaussians), device=gaussians.means.device).split(ROWS)
-    ]
+    positions = torch.stack([position_of(place, gaussians.means) for place in places])
+    rows = max(PAIRS // len(places), 1)
+    blocks = zip(gaussians.means.split(rows), gaussians.shN.split(rows), strict=True)
+    changes = [_fitted(means, shN, kept, positions) for means, shN in blocks]
     change = torch.cat(changes).to(gaussians.sh0)
     low = gaussians.shN[:, : kept - 1] + change[:, 1:]
     return gaussians.replace(sh0=gaussians.sh0 + change[:, :1], shN=low.contiguous())
 
 
-def _fitted(means: Tensor, shN: Tensor, kept: int, places: Sequence[Place]) -> Tensor:
+def _fitted(means: Tensor, shN: Tensor, kept: int, positions: Tensor) -> Tensor:
     """``[n, kept, 3]`` the changes of the coefficients that remain."""
     high = shN[:, kept - 1 :].double()
-    squares = torch.zeros(len(means), kept, kept, dtype=torch.float64, device=means.device)
-    products = torch.zeros(len(means), kept, 3, dtype=torch.float64, device=means.device)
-    for place in places:
-        away = means.double() - position_of(place, means).double()
-        distances = away.norm(dim=1, keepdim=True).clamp(min=1e-12)
-        basis = sh_basis(away / distances)[:, : kept + high.shape[1]]
-        low = basis[:, :kept]
-        lost = (basis[:, kept:, None] * high).sum(1)
-        squares += low[:, :, None] * low[:, None]
-        products += low[:, :, None] * lost[:, None]
-    identity = torch.eye(kept, dtype=torch.float64, device=means.device)
-    ridge = RIDGE * max(len(places), 1) * identity
-    return torch.linalg.solve(squares + ridge, products)
+    away = means[:, None].double() - positions.double()
+    directions = away / away.norm(dim=2, keepdim=True).clamp(min=1e-12)
+    basis = sh_basis(directions.flatten(0, 1)).unflatten(0, away.shape[:2])
+    low = basis[..., :kept]
+    lost = basis[..., kept : kept + high.shape[1]] @ high
+    ridge = RIDGE * len(positions) * torch.eye(kept, dtype=torch.float64, device=means.device)
+    return torch.linalg.solve(low.mT @ low + ridge, low.mT @ lost)

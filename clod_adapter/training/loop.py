@@ -92,21 +92,18 @@ def adapt(
     config = config.for_views(len(scene.train))
     require_trainable(base, scene, config, group.size if group else 1)
     began = time.perf_counter()
-    # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
-    reduced = base if config.lr_shN > 0 else base.without_empty_bands()
-    views = usable_views(reduced, scene.train)
+    views = usable_views(base, scene.train)
     with progress_bar(False if progress is None and group and group.rank else progress) as listener:
         # for a resumed run too, the same again
-        start = _initialized(reduced, views, config, listener, group)
-        empty_harmonics = base.shN.shape[1] - reduced.shN.shape[1]
-        trainer = Trainer(start, views, config, group, empty_harmonics)
+        start = _initialized(base, views, config, listener, group)
+        trainer = Trainer(start, views, config, group)
         trainer.start_seconds = time.perf_counter() - began
         if resume is not None:
             try:
                 trainer.restore(resume)
             except ClodError as error:
                 raise StateRejected(str(error)) from error
-        del resume, start, base, reduced  # the trainer has copies
+        del resume, start, base  # the trainer has copies
         return _train(trainer, listener)
 
 
@@ -128,7 +125,7 @@ def time_steps(
 
 
 def _initialized(
-    reduced: Gaussians,
+    base: Gaussians,
     views: tuple[View, ...],
     config: AdaptConfig,
     progress: Listener | None = None,
@@ -137,11 +134,11 @@ def _initialized(
     """The Gaussians that training begins with; in a group the first process's, as others may round
     differently.
     """
-    start = for_training(form_of(config).begin(reduced, views, config, progress))
+    start = for_training(form_of(config).begin(base, views, config, progress))
     fields: Any = {name: getattr(start, name) for name in (*start.tensors(), "attenuation")}
     if group:
         fields = group.broadcast(fields)
-    return start.replace(**fields).to(reduced.means.device)
+    return start.replace(**fields).to(base.means.device)
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:

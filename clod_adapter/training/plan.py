@@ -133,8 +133,3 @@ class Plan:
             asdict(decision) | {"measured": decision.measured} for decision in self.decisions
         ]
         return {"decisions": decisions, "seconds": seconds}
-
-
-def psnr_change(psnr: float, reference: float) -> float:
-    """dB between two PSNR; 0 where both are infinite."""
-    return 0.0 if psnr == reference else psnr - reference

@@ -20,7 +20,7 @@ from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
 from clod_adapter.training.dial import require_trainable
 from clod_adapter.training.paper import form_of
-from clod_adapter.training.plan import NOT_NEEDED, RATES, Decision, Override, Plan, psnr_change
+from clod_adapter.training.plan import NOT_NEEDED, RATES, Decision, Override, Plan
 
 # dB: SH degrees are left out if the PSNR of the training views changes by less without them
 LIMIT = 0.02
@@ -154,7 +154,7 @@ def sh_degree_losses(
     expected = quality(highest) if highest else []
     for degree in range(highest, 0, -1):
         pairs = zip(expected, quality(degree - 1), strict=True)
-        change = fmean(abs(psnr_change(a, b)) for a, b in pairs)
+        change = fmean(0.0 if a == b else abs(a - b) for a, b in pairs)  # both may be infinite
         yield degree, change
         if not change < limit:
             return

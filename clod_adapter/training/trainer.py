@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
@@ -41,9 +40,6 @@ class Trainer:
     """Holds everything that training steps change. The start has a growth_d if the config has
     growth.
 
-    Args:
-        empty_harmonics: the number of coefficients of the empty SH degrees that were removed.
-
     Attributes:
         count: the number of trained rows, the first ones.
         parameters: tensors by name, those of the dial too; ``stepped``: names of those that are
@@ -61,7 +57,6 @@ class Trainer:
         views: tuple[View, ...],
         config: AdaptConfig,
         group: ProcessGroup | None = None,
-        empty_harmonics: int = 0,
     ) -> None:
         # Places of the result's rows in training, where far ones come first.
         self.order: Tensor | None = None
@@ -106,7 +101,6 @@ class Trainer:
             for rows, parameters in parameters_by_rows.items()
             if parameters
         }
-        self.empty_harmonics = empty_harmonics
         self.done = 0
         self.seconds = 0.0
         self.start_seconds = 0.0
@@ -251,8 +245,7 @@ class Trainer:
         gaussians = self._assembled(self.parameters | self.averages())
         if self.order is not None:
             gaussians = gaussians.select(self.order)
-        shN = pad(gaussians.shN, (0, 0, 0, self.empty_harmonics))
-        return in_world_units(gaussians.replace(shN=shN))
+        return in_world_units(gaussians)
 
     def averages(self) -> dict[str, Tensor]:
         """The mean parameters, of all rows; none before there is a mean."""
