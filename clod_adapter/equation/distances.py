@@ -56,9 +56,10 @@ def normalizing_distance(
     plane, or over all where there is none. It is at least the smallest normal number, so that 0 / D
     is 0, and 1 where there are no Gaussians.
     """
-    if config.form == "ours" or len(distances) == 0:
-        value = config.scene_distance if config.form == "ours" else 1.0
-        return torch.full((), value, dtype=distances.dtype, device=distances.device)
+    if config.form == "ours":
+        return distances.new_full((), config.scene_distance)
+    if len(distances) == 0:
+        return distances.new_full((), 1.0)
     inside = in_frustum(means, camera)
     # Without a selection, for whose size the host would wait for a GPU.
     largest = distances.where(inside | ~inside.any(), 0).max()

@@ -135,10 +135,9 @@ def _initialized(
     differently.
     """
     start = for_training(form_of(config).begin(base, views, config, progress))
-    fields: Any = {name: getattr(start, name) for name in (*start.tensors(), "attenuation")}
     if group:
-        fields = group.broadcast(fields)
-    return start.replace(**fields).to(base.means.device)
+        start = group.broadcast(start)
+    return start.to(base.means.device)
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:

@@ -55,25 +55,22 @@ class RowAdam:
         units: dict[str, Tensor] | None = None,
     ):
         self.parameters = parameters
-        no_scaling = torch.ones(1, dtype=torch.float32)
-        self._units = {
-            name: (units or {}).get(name, no_scaling.to(p.device)) for name, p in parameters.items()
-        }
+        self._units = {name: p.new_ones(1) for name, p in parameters.items()} | (units or {})
         self.beta1 = beta1
         self.beta2 = beta2
         self.epsilon = epsilon
         self.moments = dict[str, dict[str, Tensor]]()
         for kind in ("first", "second"):
             self.moments[kind] = {name: torch.zeros_like(p) for name, p in parameters.items()}
-        (rows, *_), device = next((p.shape, p.device) for p in parameters.values())
-        self.steps = torch.zeros(rows, dtype=torch.int32, device=device)
+        some = next(iter(parameters.values()))
+        self.steps = torch.zeros(len(some), dtype=torch.int32, device=some.device)
         # After so many steps of its own a row's bias corrections are 1 in float32.
         last = math.ceil(-25 * math.log(2) / math.log(max(beta1, beta2)))
         count = np.arange(1, last + 2)
         with np.errstate(under="ignore"):
             corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
         table = np.pad(corrections, ((0, 0), (1, 0))).astype(np.float32)
-        self._corrections = torch.from_numpy(table).to(device)
+        self._corrections = torch.from_numpy(table).to(some.device)
 
     @torch.no_grad()
     def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
@@ -94,21 +91,12 @@ class RowAdam:
 
         jobs = list[tuple[Any, ...]]()
         for name, parameter in self.parameters.items():
-            tensors = (
-                parameter,
-                *(moments[name] for moments in self.moments.values()),
-                gradients[name].contiguous(),
-            )
-            flat = [_as_matrix(tensor).numpy() for tensor in tensors]
-            counted = 0 if jobs else 1
-            row_arrays = (
-                rows.numpy(),
-                self.steps.numpy(),
-                counted,
-                self._corrections.numpy(),
-                self._units[name].numpy(),
-            )
-            jobs.append((*flat, *row_arrays, rates[name]))
+            moments = [kind[name] for kind in self.moments.values()]
+            tensors = (parameter, *moments, gradients[name].contiguous())
+            job: list[Any] = [_as_matrix(tensor).numpy() for tensor in tensors]
+            counted = 0 if jobs else 1  # rows count their steps once
+            job += [rows.numpy(), self.steps.numpy(), counted, self._corrections.numpy()]
+            jobs.append((*job, self._units[name].numpy(), rates[name]))
 
         def adam(worker: int, workers: int) -> None:
             for job in jobs:

@@ -193,16 +193,15 @@ def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
 
 def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
     """The views with their teachers on ``device``: equal ones once, as a checkpoint is large."""
-    on_device = dict[int, Gaussians]()
-    moved = list[View]()
-    for view in views:
-        if isinstance(view, PseudoView):
-            number = id(view.teacher)
-            if number not in on_device:
-                on_device[number] = view.teacher.to(device)
-            view = PseudoView(view.camera, on_device[number], view.reach, view.backed)
-        moved.append(view)
-    return tuple(moved)
+    teachers = {id(view.teacher): view.teacher for view in views if isinstance(view, PseudoView)}
+    on_device = {number: teacher.to(device) for number, teacher in teachers.items()}
+
+    def moved(view: View) -> View:
+        if not isinstance(view, PseudoView):
+            return view
+        return PseudoView(view.camera, on_device[id(view.teacher)], view.reach, view.backed)
+
+    return tuple(map(moved, views))
 
 
 def _field(camera: Camera) -> float:

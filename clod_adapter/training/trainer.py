@@ -86,10 +86,10 @@ class Trainer:
         self.sampler = ViewSampler(views, config, self.dial.schedule)
         self.screen_filter = start.screen_filter
         # The count term has a gradient of culled Gaussians too.
-        everywhere = {self.dial.decay, *self.dial.everywhere}
-        parameters_by_rows = {"kept": dict[str, Tensor](), "all": {}}
-        for name, value in self.trained().items():
-            parameters_by_rows["all" if name in everywhere else "kept"][name] = value
+        everywhere = (self.dial.decay, *self.dial.everywhere)
+        parameters_by_rows = {"kept": self.trained(), "all": dict[str, Tensor]()}
+        for name in everywhere:
+            parameters_by_rows["all"][name] = parameters_by_rows["kept"].pop(name)
         units = {"means": own_sizes(start.log_scales[: self.count])}
         self.optimizers = {
             rows: RowAdam(
@@ -242,19 +242,13 @@ class Trainer:
 
     def gaussians(self) -> Gaussians:
         """The result so far, in world units: the mean where there is one, else the parameters."""
-        gaussians = self._assembled(self.parameters | self.averages())
+        parameters = dict(self.parameters)
+        for name, mean in self.mean.items():
+            parameters[name] = torch.cat([mean, parameters[name][self.count :]])
+        gaussians = self._assembled(parameters)
         if self.order is not None:
             gaussians = gaussians.select(self.order)
         return in_world_units(gaussians)
-
-    def averages(self) -> dict[str, Tensor]:
-        """The mean parameters, of all rows; none before there is a mean."""
-        if self.count == len(self.parameters["means"]):
-            return self.mean
-        return {
-            name: torch.cat([mean, self.parameters[name][self.count :]])
-            for name, mean in self.mean.items()
-        }
 
     def _assembled(self, parameters: dict[str, Tensor]) -> Gaussians:
         values: Any = {name: parameters[name] for name in ATTRIBUTES}

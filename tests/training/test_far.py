@@ -9,6 +9,7 @@ import pytest
 import torch
 from plyfile import PlyData
 from refusals import refused
+from torch.nn.functional import pad
 
 import clod_adapter as clod
 from clod_adapter import adapt, detach, make_plan, render
@@ -31,6 +32,14 @@ PLAIN = Rasterizer(reference.rasterize)
 @pytest.fixture(scope="module")
 def both():
     return capture()
+
+
+def test_far_ones_have_harmonics_where_higher_degrees_are_empty(both):
+    base, scene = both
+    empty = pad(base.shN, (0, 0, 0, 5))
+    found = adapt(base.replace(shN=empty), scene, config_of(iters=0)).gaussians
+    assert torch.equal(found.shN[:, :3], adapt(base, scene, config_of(iters=0)).gaussians.shN)
+    assert found.shN[~found.near, :3].any() and not found.shN[:, 3:].any()
 
 
 @pytest.fixture(scope="module")
