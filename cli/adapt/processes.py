@@ -24,7 +24,7 @@ from clod_adapter.training.distributed import (
     joined,
     require_distributed,
 )
-from clod_adapter.training.pseudo_views import teachers_to
+from clod_adapter.training.pseudo_views import supervision_to
 from clod_adapter.training.state import Adapted, TrainingState
 
 from ..shared.console import ProgressDisplay
@@ -128,7 +128,7 @@ def _train(group: ProcessGroup, launch: Launch, stop: GracefulStop) -> None:
                 " there are"
             )
         torch.cuda.set_device(launch.local_rank)
-    scene = Scene(teachers_to(job.views, job.device), ())
+    scene = Scene(supervision_to(job.views, job.device), ())
     start = job.start.to(job.device)
     adapt(start, scene, job.config, stop.stop_on_signal(), job.state, group=group)
 

@@ -38,8 +38,8 @@ FARTHER = 4.0
 
 
 class PseudoView(StoredView):
-    """A view whose photograph is a rendering of ``teacher``, made when it is read, and from nearby
-    in each step.
+    """A view whose photograph is a rendering of ``supervision``, made when it is read, and from
+    nearby in each step.
 
     With a fixed set of renderings Gaussians drift towards what only these cameras see. ``at``
     returns a fixed one. ``reach`` is the unit of a moved camera's offset (``reaches``), ``backed``
@@ -47,17 +47,17 @@ class PseudoView(StoredView):
     """
 
     def __init__(
-        self, camera: Camera, teacher: Gaussians, reach: float, backed: float = 0.0
+        self, camera: Camera, supervision: Gaussians, reach: float, backed: float = 0.0
     ) -> None:
-        super().__init__(camera, lambda: render(teacher, camera).pixels.cpu())
-        self.__dict__.update(teacher=teacher, reach=reach, backed=backed)
+        super().__init__(camera, lambda: render(supervision, camera).pixels.cpu())
+        self.__dict__.update(supervision=supervision, reach=reach, backed=backed)
 
-    teacher: Gaussians
+    supervision: Gaussians
     reach: float
     backed: float
 
     def __reduce__(self) -> tuple[type[PseudoView], tuple[Any, ...]]:  # type: ignore[override]
-        return PseudoView, (self.camera, self.teacher, self.reach, self.backed)
+        return PseudoView, (self.camera, self.supervision, self.reach, self.backed)
 
     def moved(self, random: np.random.Generator) -> View:
         """A view from a random camera near this one, or behind it; rendered when its image is
@@ -74,7 +74,7 @@ class PseudoView(StoredView):
             viewmat[2, 3] += self.reach * (FARTHER ** random.random() - 1)
         K = self.camera.K * self.camera.K.new_tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
         camera = replace(self.camera, viewmat=viewmat, K=K)
-        return StoredView(camera, lambda: render(self.teacher, camera).pixels)
+        return StoredView(camera, lambda: render(self.supervision, camera).pixels)
 
 
 def only_pseudo(views: Sequence[View]) -> bool:
@@ -93,7 +93,7 @@ def render_pseudo_views(
     it instead (``PseudoView.moved``); ``view.at(view.camera)`` stays where it is.
 
     Args:
-        gaussians: the teacher, rendered at s = 1.
+        gaussians: the supervision, rendered at s = 1.
         progress: called in ``Phase.PSEUDO_VIEWS`` after each view that is held out.
 
     Example:
@@ -101,8 +101,8 @@ def render_pseudo_views(
         >>> cameras = clod.place_cameras(base.gaussians)
         >>> scene = clod.render_pseudo_views(base.gaussians, cameras)
     """
-    teacher = gaussians.without_empty_bands()
-    train = _views(teacher, cameras, backed=BACKED)
+    supervision = gaussians.without_empty_bands()
+    train = _views(supervision, cameras, backed=BACKED)
     test = list[View]()
     if len(cameras) > 1:
         held_out = train[::TEST_EVERY]
@@ -113,7 +113,7 @@ def render_pseudo_views(
     size = f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"
     note = (
         f"no photographs: {len(train)} pseudo views to train on, {len(test)} held out, {size}; the"
-        " checkpoint is the teacher, and all numbers compare with its renderings, not with"
+        " checkpoint is the supervision, and all numbers compare with its renderings, not with"
         " photographs"
     )
     return Scene(tuple(train), tuple(test), (note,))
@@ -163,9 +163,9 @@ def add_pseudo_views(
     except ClodError as error:
         note = f"{shortage} may be too few, and no pseudo views can be added: {error}"
         return replace(scene, notes=(*scene.notes, note))
-    teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
-    near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
-    pseudo_views = (*nearby * near, *_views(teacher, placed))
+    supervision = gaussians.without_empty_bands()  # one for all: it may be a copy
+    near = _views(supervision, [view.camera for view in photographs], wider=WIDER)
+    pseudo_views = (*nearby * near, *_views(supervision, placed))
     note = (
         f"{shortage}: {len(pseudo_views)} pseudo views, the checkpoint's own renderings, are added"
     )
@@ -173,10 +173,10 @@ def add_pseudo_views(
 
 
 def _views(
-    teacher: Gaussians, cameras: Sequence[Camera], *, wider: float = 1.0, backed: float = 0.0
+    supervision: Gaussians, cameras: Sequence[Camera], *, wider: float = 1.0, backed: float = 0.0
 ) -> list[PseudoView]:
-    pairs = zip(cameras, reaches(teacher, cameras), strict=True)
-    return [PseudoView(camera, teacher, wider * reach, backed) for camera, reach in pairs]
+    pairs = zip(cameras, reaches(supervision, cameras), strict=True)
+    return [PseudoView(camera, supervision, wider * reach, backed) for camera, reach in pairs]
 
 
 def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
@@ -191,15 +191,17 @@ def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
     return [min(distance, most) for distance in medians]
 
 
-def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
-    """The views with their teachers on ``device``: equal ones once, as a checkpoint is large."""
-    teachers = {id(view.teacher): view.teacher for view in views if isinstance(view, PseudoView)}
-    on_device = {number: teacher.to(device) for number, teacher in teachers.items()}
+def supervision_to(views: Sequence[View], device: str) -> tuple[View, ...]:
+    """The views with their supervision on ``device``: equal ones once, as a checkpoint is large."""
+    pseudo_views = [view for view in views if isinstance(view, PseudoView)]
+    checkpoints = {id(view.supervision): view.supervision for view in pseudo_views}
+    on_device = {number: gaussians.to(device) for number, gaussians in checkpoints.items()}
 
     def moved(view: View) -> View:
         if not isinstance(view, PseudoView):
             return view
-        return PseudoView(view.camera, on_device[id(view.teacher)], view.reach, view.backed)
+        gaussians = on_device[id(view.supervision)]
+        return PseudoView(view.camera, gaussians, view.reach, view.backed)
 
     return tuple(map(moved, views))
 
