@@ -9,9 +9,8 @@ colors, alphas, meta = clod_gsplat.rasterization(
 
 gsplat takes one opacity and scale per Gaussian for all cameras; the dial gives one for each camera.
 So each camera is one call of gsplat; the images are stacked as gsplat's, and ``meta`` is a list of
-each camera's. (A batch of scenes could share a call, but gsplat 1.5.3's packed projection culls all
-scenes by the opacities of the first.) Culled Gaussians cost no more than Gaussians out of view.
-Nothing is gathered: rows and ids stay those of the caller.
+each camera's. Culled Gaussians cost no more than Gaussians out of view. Nothing is gathered: rows
+and ids stay those of the caller.
 
 For gsplat 1.4.0 to 1.6.0: the signatures are those of the installed version, and the four.
 """
@@ -79,7 +78,7 @@ def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Meta]:
     """``gsplat.rasterization`` with the opacities and scales of one dial value, for each camera.
 
     Equals gsplat called with the opacities of ``attenuation.attenuate`` and ``scales`` times its
-    growth (``covars``, where given, times its square), camera by camera for ``[..., C, 4, 4]``.
+    growth (``covars``, where given, times its square), camera by camera for ``[C, 4, 4]``.
     Differentiable in ``sigma_d``, ``growth_d`` and all that gsplat differentiates in; the distances
     are constants, so the dial adds nothing to the gradients of ``means`` and ``viewmats``. ``meta``
     of one camera is gsplat's, as densification strategies need it. ``meta`` of several is a list of
@@ -93,7 +92,7 @@ def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Meta]:
     takes the frustum of a pinhole camera with these ``Ks``.
 
     Args:
-        sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged, with a
+        sigma_d: ``[N]`` like ``opacities``; None calls gsplat's function unchanged, with a
             warning if ``virtual_scale`` is above 1.
         virtual_scale: the dial s >= 0.
         attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
@@ -105,14 +104,15 @@ def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Meta]:
     The others are those of the installed gsplat, by position or by name, with its defaults.
 
     Returns:
-        ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``, for
-        several cameras a list.
+        ``render_colors [C, H, W, X]``, ``render_alphas [C, H, W, 1]`` and ``meta``, for several
+        cameras a list.
 
     Raises:
         ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds
             integers, sigma_d or growth_d differs from opacities in shape, ``distributed`` is set,
-            with which the cameras of all processes share one opacity, or several cameras come with
-            a tensor that none of the known versions has.
+            with which the cameras of all processes share one opacity, several scenes are given in
+            batch dimensions, or several cameras come with a tensor that none of the known versions
+            has.
         TypeError: an argument is missing, or the installed gsplat does not have it.
     """
     raise NotImplementedError
@@ -129,7 +129,7 @@ def rasterization_2dgs(
 
     Returns:
         Colours, alphas, normals, normals from depth (None without a depth), distortion and median
-        depth of ``[..., C, H, W, X]``, and ``meta``.
+        depth of ``[C, H, W, X]``, and ``meta``.
     """
     raise NotImplementedError
 

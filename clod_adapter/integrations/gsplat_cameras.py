@@ -8,10 +8,8 @@ behind the camera.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,9 +28,8 @@ PER_CAMERA = (
     "radial_coeffs",
     "tangential_coeffs",
     "thin_prism_coeffs",
-    "rays",
 )
-# arguments by Gaussian or by view and Gaussian, and the SH degree of each
+# arguments by Gaussian or by camera and Gaussian, and the SH degree of each
 PER_EITHER = {"colors": "sh_degree", "extra_signals": "extra_signals_sh_degree"}
 
 
@@ -59,14 +56,16 @@ def render(
                 f" {tuple(arguments['opacities'].shape)}; both must be [..., N]"
             )
     shape = arguments["viewmats"].shape[:-2]
-    render_one = partial(
-        _one_camera, function, virtual_scale=virtual_scale, config=config, hide=hide
-    )
-    if math.prod(shape) == 1:
-        return render_one(arguments)
-    return _joined(
-        [render_one(camera_arguments) for camera_arguments in _cameras(arguments, shape)], shape
-    )
+    several = math.prod(shape) > 1
+    if several and len(shape) > 1:
+        raise ClodError(
+            f"viewmats is {tuple(arguments['viewmats'].shape)}, of several scenes, and the dial's"
+            " settings are of one; render one scene at a time"
+        )
+    results = []
+    for of_camera in _cameras(arguments) if several else [arguments]:
+        results.append(_one_camera(function, of_camera, virtual_scale, config, hide))
+    return _joined(results) if several else results[0]
 
 
 def _one_camera(
@@ -109,46 +108,37 @@ def _one_camera(
     return function(**drawn_arguments)
 
 
-def _cameras(arguments: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any]]:
-    """Arguments for each camera, without batch dimensions, in gsplat's order of images."""
-    with_cameras = {*PER_GAUSSIAN, *PER_CAMERA, *PER_EITHER}
-    if unknown := [
-        name
-        for name, value in arguments.items()
-        if isinstance(value, Tensor) and name not in with_cameras
-    ]:
+def _cameras(arguments: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Arguments for each camera."""
+    tensors = {name: value for name, value in arguments.items() if isinstance(value, Tensor)}
+    of_camera = [name for name in PER_CAMERA if name in tensors]
+    for name, degree in PER_EITHER.items():
+        # a dimension of cameras, before N rows or N rows of K coefficients
+        dimensions = 3 if arguments.get(degree) is None else 4
+        if name in tensors and tensors[name].dim() == dimensions:
+            of_camera.append(name)
+    count = len(tensors["viewmats"])
+    if "rays" in tensors:  # the only one that gsplat broadcasts
+        tensors["rays"] = tensors["rays"].expand(count, -1, -1, -1)
+        of_camera.append("rays")
+    unknown = tensors.keys() - {*PER_GAUSSIAN, *PER_EITHER, *of_camera}
+    if unknown:
         raise ClodError(
-            f"{unknown[0]} may differ between cameras in a way unknown here; render one camera at a"
-            " time"
+            f"{min(unknown)} may differ between cameras in a way unknown here; render one camera at"
+            " a time"
         )
-    if isinstance(arguments.get("rays"), Tensor):  # the only one that gsplat broadcasts
-        arguments = {**arguments, "rays": arguments["rays"].expand(*shape, *[-1] * 3)}
-    for index in np.ndindex(*shape):
-        batch = index[:-1] or ...
-        camera = (*index[:-1], slice(index[-1], index[-1] + 1))
-        places = dict.fromkeys(PER_GAUSSIAN, batch) | dict.fromkeys(PER_CAMERA, camera)
-        for name, degree in PER_EITHER.items():
-            if isinstance(value := arguments.get(name), Tensor):
-                # before N rows, or before N rows of K coefficients
-                leading = value.dim() - (2 if arguments[degree] is None else 3)
-                places[name] = camera if leading == len(shape) else batch if leading else ...
-        yield {
-            name: value[places[name]] if isinstance(value, Tensor) else value
-            for name, value in arguments.items()
-        }
+    for k in range(count):
+        yield arguments | {name: tensors[name][k : k + 1] for name in of_camera}
 
 
-def _joined(results: Sequence[Any], shape: torch.Size) -> Any:
-    """gsplat's result for all images from that of each, ``meta`` as a list; ``shape`` has batch
-    dimensions and cameras.
-    """
+def _joined(results: Sequence[Any]) -> Any:
+    """gsplat's result for several cameras from that of each, ``meta`` as a list."""
     first = results[0]
     if isinstance(first, tuple):
-        return tuple(_joined(same, shape) for same in zip(*results, strict=True))
+        return tuple(_joined(same) for same in zip(*results, strict=True))
     if isinstance(first, dict):
         return list(results)
     if first is None:
         return None
-    each = [result.reshape(result.shape[-3:]) for result in results]
-    images = torch.stack(each).unflatten(0, shape)
-    return images.squeeze(0) if first.dim() == 3 else images  # as gsplat squeezes some
+    # as gsplat squeezes some
+    return torch.cat([image.reshape(-1, *image.shape[-3:]) for image in results])

@@ -2,7 +2,6 @@
 
 import inspect
 
-import numpy as np
 import pytest
 import torch
 from refusals import refused
@@ -62,13 +61,12 @@ class Gsplat:
         surfaces = (image, image[0], image, image) if name == "rasterization_2dgs" else ()
         return image, image[..., :1], *surfaces, self.meta
 
-    def arguments(self, name, batch=(), cameras=CAMERAS):
+    def arguments(self, name, cameras=CAMERAS):
         """Every tensor that a function takes, random; of cameras the position and the principal
         point.
         """
         generator = seeded(0)
-        shapes = {key: (*batch, *shape) for key, shape in OF_SCENE.items()}
-        shapes |= {key: (*batch, cameras, *shape) for key, shape in OF_CAMERA.items()}
+        shapes = OF_SCENE | {key: (cameras, *shape) for key, shape in OF_CAMERA.items()}
         given = {key: 0.1 + torch.rand(shape, generator=generator) for key, shape in shapes.items()}
         for key, size in {"viewmats": 4, "Ks": 3}.items():
             given[key][..., :-1], given[key][..., -1, -1] = torch.eye(size)[:, :-1], 1
@@ -93,28 +91,25 @@ def test_signatures_are_the_installed_ones_and_four(monkeypatch, version):
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_camera_is_a_call_with_its_part_of_every_argument(monkeypatch, version, name):
     """Images are joined, where gsplat returns those of all cameras or refuses several."""
-    batches = ((), (2,)) if name in FUNCTIONS[:2] and version not in ("1.4.0", "1.5.0") else ((),)
-    for batch in batches:
-        gsplat = Gsplat(monkeypatch, version)
-        given = gsplat.arguments(name, batch)
-        dial = {"sigma_d": torch.full((*batch, N), 1e9), "attenuation": WHOLE}
-        found = getattr(gsplat.ours, name)(**given, **dial)
-        places = list(np.ndindex(*batch, CAMERAS))
-        for call, place in zip(gsplat.calls, places, strict=True):
-            for key, value in given.items():
-                if isinstance(value, Tensor):
-                    want = value[place][None] if key in OF_CAMERA else value[place[:-1]]
-                    torch.testing.assert_close(call[key], want, rtol=1e-5, atol=1e-6)
-        image = found[0][0] if isinstance(found[0], tuple) else found[0]
-        assert image.shape == (*batch, CAMERAS, HEIGHT, WIDTH, 3)
-        assert image[..., 0, 0, 0].flatten().tolist() == [1 + k for k in range(len(places))]
-        harmonics = torch.rand(*batch, N, 4, 3)
-        getattr(gsplat.ours, name)(**given | {"colors": harmonics, "sh_degree": 1}, **dial)
-        assert torch.equal(gsplat.calls[-1]["colors"], harmonics[-1] if batch else harmonics)
-        if "rays" in given:  # the only argument that gsplat broadcasts
-            ray = given["rays"][(0,) * len(batch)][:1]
-            gsplat.ours.rasterization(**given | {"rays": ray, "colors": None}, **dial)
-            assert torch.equal(gsplat.calls[-1]["rays"], ray)
+    gsplat = Gsplat(monkeypatch, version)
+    given = gsplat.arguments(name)
+    dial = {"sigma_d": torch.full((N,), 1e9), "attenuation": WHOLE}
+    found = getattr(gsplat.ours, name)(**given, **dial)
+    for k, call in enumerate(gsplat.calls):
+        for key, value in given.items():
+            if isinstance(value, Tensor):
+                want = value[k][None] if key in OF_CAMERA else value
+                torch.testing.assert_close(call[key], want, rtol=1e-5, atol=1e-6)
+    image = found[0][0] if isinstance(found[0], tuple) else found[0]
+    assert image.shape == (CAMERAS, HEIGHT, WIDTH, 3)
+    assert image[:, 0, 0, 0].tolist() == [1 + k for k in range(CAMERAS)]
+    harmonics = torch.rand(N, 4, 3)
+    getattr(gsplat.ours, name)(**given | {"colors": harmonics, "sh_degree": 1}, **dial)
+    assert torch.equal(gsplat.calls[-1]["colors"], harmonics)
+    if "rays" in given:  # the only argument that gsplat broadcasts
+        ray = given["rays"][:1]
+        gsplat.ours.rasterization(**given | {"rays": ray, "colors": None}, **dial)
+        assert torch.equal(gsplat.calls[-1]["rays"], ray)
 
 
 def test_meta_of_several_cameras_is_a_list(monkeypatch):
@@ -163,6 +158,7 @@ def test_bad_arguments_are_refused(monkeypatch):
         ({"distributed": True}, "distributed=True shares one opacity"),
         ({"sigma_d": sigma_d[1:]}, r"sigma_d is \(4,\) and opacities \(5,\)"),
         ({"growth_d": sigma_d[1:], "attenuation": WHOLE}, r"growth_d is \(4,\) and"),
+        ({"viewmats": given["viewmats"][None]}, "of several scenes, .* one scene at a time"),
     ):
         with refused(message):
             gsplat.ours.rasterization(**given | changed)
