@@ -261,7 +261,6 @@ class AdaptConfig:
         own: dict[str, Any] = {
             "form": "paper",
             "iters": 1600,
-            "reg_weight": 1.0,
             "growth": "off",
             "lr_sigma": 1e-2,
             "lr_means": 0.03,

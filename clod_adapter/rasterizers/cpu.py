@@ -296,23 +296,15 @@ def rasterize(
     screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:
     """See ``clod_adapter.rasterizers.Splat``; of float32 tensors alone."""
-    require_float32(
-        "CPU",
-        means=means,
-        quats=quats,
-        scales=scales,
-        opacities=opacities,
-        sh0=sh0,
-        shN=shN,
-        background=background,
-    )
+    inputs = Stored(means, quats, scales, opacities, NOTHING, NOTHING, sh0, shN)
+    require_float32("CPU", **inputs._asdict(), background=background)
     return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
         camera,
         screen_filter,
         Dial(activated=True),
         len(means),
         background,
-        *Stored(means, quats, scales, opacities, NOTHING, NOTHING, sh0, shN),
+        *inputs,
     )
 
 

@@ -29,18 +29,18 @@ class Decision:
     Attributes:
         what: the part of the checkpoint.
         verdict: "kept", "left out", of an attribute "frozen", or NOT_NEEDED.
-        number: the measured effect, in ``unit``; None if nothing was measured.
         why: what the number is, or the reason if there is none.
         name: the name in NAMES by which ``Override`` changes it; empty if there is nothing to
             change.
+        number: the measured effect, in ``unit``; None if nothing was measured.
     """
 
     what: str
     verdict: str
-    number: float | None
-    unit: str
     why: str
     name: str = ""
+    number: float | None = None
+    unit: str = ""
 
     @property
     def measured(self) -> str:

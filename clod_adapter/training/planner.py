@@ -64,12 +64,12 @@ def make_plan(
         initial = form_of(config).begin(base.without_bands(degree), views, config, progress)
     if added := len(initial) - len(base):
         why = "take over in the distance from the checkpoint's own, which stay as they are"
-        decisions.append(Decision("far Gaussians", "added", float(added), "", why))
+        decisions.append(Decision("far Gaussians", "added", why, number=float(added)))
     if config.form == "ours" and config.max_sv > 1:
         decisions.append(_far_end(initial, views, config))
     frozen = [name for name in RATES if name in override.leave_out]
-    decisions += [Decision(name, "frozen", None, "", REQUESTED, name) for name in frozen]
-    decisions += [Decision(item, NOT_NEEDED, None, "", why) for item, why in scene.left_out]
+    decisions += [Decision(name, "frozen", REQUESTED, name) for name in frozen]
+    decisions += [Decision(item, NOT_NEEDED, why) for item, why in scene.left_out]
     rates: dict[str, Any] = {RATES[name]: 0.0 for name in frozen}
     return Plan(base, tuple(decisions), initial, degree, replace(config, **rates), seconds)
 
@@ -88,11 +88,11 @@ def _sh_degree(
     highest = base.sh_degree
     views = spread(views, MEASURED_VIEWS)
     if highest == 0:
-        return 0, [Decision("SH degrees", NOT_NEEDED, None, "", "there are none")]
+        return 0, [Decision("SH degrees", NOT_NEEDED, "there are none")]
     if "bands" in override.keep:
-        return highest, [Decision("SH degrees", "kept", None, "", REQUESTED, "bands")]
+        return highest, [Decision("SH degrees", "kept", REQUESTED, "bands")]
     if "bands" in override.leave_out:
-        return 0, [Decision("SH degrees", "left out", None, "", REQUESTED, "bands")]
+        return 0, [Decision("SH degrees", "left out", REQUESTED, "bands")]
     degree = highest
     decisions = list[Decision]()
     plural = "s" if len(views) > 1 else ""
@@ -103,9 +103,9 @@ def _sh_degree(
             what += f" to {highest}"
         if loss < LIMIT:  # one decision for all that are left out
             degree = band - 1
-            decisions = [Decision(what, "left out", loss, "dB", why, "bands")]
+            decisions = [Decision(what, "left out", why, "bands", loss, "dB")]
         else:
-            decisions.append(Decision(what, "kept", loss, "dB", why, "bands"))
+            decisions.append(Decision(what, "kept", why, "bands", loss, "dB"))
         tell(progress, Phase.SH_DEGREES, highest - band + 1, highest)
     return degree, decisions
 
@@ -130,7 +130,7 @@ def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> 
     if config.max_sv < farther < FARTHEST:
         reached += f", {FEW:.0%} with --max-sv {farther:.2g}"
     why = "in the mean of the training views, before training"
-    return Decision(reached, "kept", None, "", why)
+    return Decision(reached, "kept", why)
 
 
 @torch.no_grad()

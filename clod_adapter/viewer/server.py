@@ -84,8 +84,6 @@ class Server(ThreadingHTTPServer):
 
     def server_bind(self) -> None:
         socketserver.TCPServer.server_bind(self)  # HTTPServer's looks up the host name
-        self.server_name = HOST
-        self.server_port = self.port
 
     def get_request(self) -> tuple[socket.socket, Any]:
         request, address = super().get_request()

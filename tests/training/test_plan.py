@@ -51,7 +51,7 @@ def test_sh_degrees_are_kept_or_left_out(visible):
     mixed = (*photograph(strong, cameras[:2]), *photograph(strong.without_bands(0), cameras[2:]))
     assert make_plan(strong, Scene(mixed, ()), CONFIG).sh_degree == 1
     plan = make_plan(base.without_bands(0), scene, CONFIG, Override(keep=ALL))
-    assert plan.decisions[0] == Decision("SH degrees", NOT_NEEDED, None, "", "there are none")
+    assert plan.decisions[0] == Decision("SH degrees", NOT_NEEDED, "there are none")
 
 
 def test_the_far_end_is_told(visible):
