@@ -12,11 +12,12 @@ better.
 
 import math
 from collections.abc import Sequence
+from dataclasses import astuple
 
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import Camera, intrinsics
+from clod_adapter.cameras import Camera, intrinsics, looking
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.quality_table import Viewpoint
@@ -107,14 +108,9 @@ def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Vi
 
 def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> Camera:
     """The camera of a viewpoint that has a direction, for images of this size."""
-    v = viewpoint
-    rows = [[v.x, v.y, v.z], [v.look_x, v.look_y, v.look_z], [v.up_x, v.up_y, v.up_z]]
-    centre, look, up = torch.tensor(rows, dtype=torch.float64)
-    right = torch.linalg.cross(look, up)
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = torch.stack([right, -up, look])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ centre
-    focal = 0.5 * height / math.tan(0.5 * v.fov)
+    values = torch.tensor(astuple(viewpoint), dtype=torch.float64)
+    viewmat = looking(eye=values[:3], forward=values[4:7], down=-values[7:10])
+    focal = 0.5 * height / math.tan(0.5 * viewpoint.fov)
     K = intrinsics(focal, focal, 0.5 * width, 0.5 * height)
     return Camera(viewmat.float(), K, width, height, name)
 
