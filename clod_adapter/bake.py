@@ -139,7 +139,10 @@ def bake_levels(gaussians: Gaussians, multiplier: float = MULTIPLIER) -> list[Le
 
 
 def _plain(
-    gaussians: Gaussians, kept: Attenuated, shown: Attenuated, grown: Attenuated
+    gaussians: Gaussians,
+    kept: Attenuated,
+    shown: Attenuated,
+    grown: Attenuated,
 ) -> Gaussians:
     """Those that are kept, with the opacities that are shown and the scales that are grown, without
     a dial.
@@ -187,7 +190,9 @@ def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tenso
 
 
 def _of_several(
-    gaussians: Gaussians, distances: Tensor, virtual_scale: float
+    gaussians: Gaussians,
+    distances: Tensor,
+    virtual_scale: float,
 ) -> tuple[Attenuated, Attenuated]:
     """What is kept over several cameras, and what is drawn of it.
 

@@ -22,7 +22,9 @@ class ClodError(Exception):
 
 @contextmanager
 def rejected_if_damaged(
-    path: Path, what: str = "is damaged or truncated", fix: str = "copy or export it again"
+    path: Path,
+    what: str = "is damaged or truncated",
+    fix: str = "copy or export it again",
 ) -> Iterator[None]:
     """Makes errors of reading a file, raised within, one line: the file, ``what`` it is, the
     reason, and the ``fix``.

@@ -135,7 +135,12 @@ def adapt_checkpoint(
 
 
 def extract_result(
-    base: Checkpoint, scene: Scene, against: str, plan: Plan, adapted: Adapted, config: AdaptConfig
+    base: Checkpoint,
+    scene: Scene,
+    against: str,
+    plan: Plan,
+    adapted: Adapted,
+    config: AdaptConfig,
 ) -> Result:
     """The result of a training, without measurements: the adapter, and the adapter applied to the
     base.

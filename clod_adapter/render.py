@@ -45,7 +45,10 @@ class Rendering:
 
 
 def splat(
-    gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None
+    gaussians: Gaussians,
+    opacities: Tensor,
+    camera: Camera,
+    growth: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Image ``[H, W, 3]`` on black and alpha ``[H, W]``, of activated opacities ``[N]`` and scales
     times ``growth``.

@@ -27,7 +27,11 @@ WORDS = {
 
 
 def align(
-    checkpoint: Checkpoint, scene: Scene, note: Note, *, required: bool
+    checkpoint: Checkpoint,
+    scene: Scene,
+    note: Note,
+    *,
+    required: bool,
 ) -> tuple[Scene, dict[str, Any]]:
     """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements
     for the report.
@@ -60,7 +64,10 @@ def align(
 
 
 def compare_frames(
-    checkpoint: Checkpoint, scene: Scene, note: Note, cameras: Sequence[Camera] = ()
+    checkpoint: Checkpoint,
+    scene: Scene,
+    note: Note,
+    cameras: Sequence[Camera] = (),
 ) -> tuple[Alignment, Guess | None]:
     """Compares renders with the photographs, and after a poor match finds a frame that explains
     them better.

@@ -143,7 +143,9 @@ def correlation(table: Tensor) -> float:
 
 @torch.no_grad()
 def compare_filters(
-    gaussians: Gaussians, views: Sequence[View], expected: str = "off"
+    gaussians: Gaussians,
+    views: Sequence[View],
+    expected: str = "off",
 ) -> tuple[str, dict[str, float]]:
     """The name in FILTERS of the filter that fits the photographs, and the mean PSNR with each.
 

@@ -198,7 +198,11 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
 
 
 def _normalized(
-    name: str, description: str, rotation: Tensor, scale: float, offset: Tensor
+    name: str,
+    description: str,
+    rotation: Tensor,
+    scale: float,
+    offset: Tensor,
 ) -> Frame:
     """The frame of ``x_file = scale (rotation x_cameras + offset)``."""
     return Frame(name, description, rotation.T, 1 / scale, -rotation.T @ offset)

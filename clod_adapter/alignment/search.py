@@ -96,7 +96,10 @@ def scene_in(scene: Scene, frame: Frame) -> Scene:
 
 
 def _small(
-    gaussians: Gaussians, views: Sequence[View], width: int, most: int
+    gaussians: Gaussians,
+    views: Sequence[View],
+    width: int,
+    most: int,
 ) -> Callable[[Frame], float]:
     """The correlation of small photographs with renders, in a frame, of the ``most`` Gaussians that
     cover most.
@@ -110,7 +113,10 @@ def _small(
 
 
 def _search(
-    gaussians: Gaussians, views: Sequence[View], score: Callable[[Frame], float], viewmats: Tensor
+    gaussians: Gaussians,
+    views: Sequence[View],
+    score: Callable[[Frame], float],
+    viewmats: Tensor,
 ) -> Frame | None:
     """The best scale and offset; None if no correlation reaches LOWEST_CORRELATION.
 

@@ -48,7 +48,11 @@ def unpack(capture: Path, base: Path) -> None:
 
 
 def draw(
-    capture: Path, base: Path, model: Path, report: Mapping[str, Any], pictures: Mapping[str, Path]
+    capture: Path,
+    base: Path,
+    model: Path,
+    report: Mapping[str, Any],
+    pictures: Mapping[str, Path],
 ) -> None:
     """Draws a held-out view of the base, the dial and the merged base, and their quality over all
     held-out views.
@@ -78,7 +82,10 @@ def merging(base: Gaussians, scene: Scene) -> Callable[[int], Gaussians]:
 
 @torch.no_grad()
 def compared(
-    base: Gaussians, model: Gaussians, view: View, merged_to: Callable[[int], Gaussians]
+    base: Gaussians,
+    model: Gaussians,
+    view: View,
+    merged_to: Callable[[int], Gaussians],
 ) -> list[Picture]:
     """Panels of one view: the base, the dial at SHARE of the Gaussians, and the base merged to as
     many.
@@ -100,7 +107,10 @@ def compared(
 
 
 def dial_strip(
-    path: str | Path, panels: Sequence[Picture], title: str, crop: tuple[int, int, int, int] = CROP
+    path: str | Path,
+    panels: Sequence[Picture],
+    title: str,
+    crop: tuple[int, int, int, int] = CROP,
 ) -> None:
     """Draws panels of one size side by side, above the part ``crop`` (left, top, width, height) of
     each enlarged.

@@ -172,7 +172,9 @@ def takeover_distance(config: AttenuationConfig, share: float) -> float:
 
 
 def kept_between(
-    gaussians: Gaussians, distances: Tensor, baked: bool = False
+    gaussians: Gaussians,
+    distances: Tensor,
+    baked: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """``[N]`` twice, float64: the dial values between which each is kept at its distance d ``[N]``,
     the end excluded; in the equation, or with ``baked`` in a plain file.
@@ -188,7 +190,10 @@ def kept_between(
 
 
 def smallest_dial(
-    fits: Callable[[float], bool], low: float, high: float, precision: float
+    fits: Callable[[float], bool],
+    low: float,
+    high: float,
+    precision: float,
 ) -> float:
     """The smallest dial value that ``fits``, by bisection of log s, to a relative precision.
 
@@ -226,7 +231,10 @@ def growth_distance(config: AttenuationConfig) -> float:
 
 
 def growth_factors(
-    growth_d: Tensor, d: Tensor, virtual_scale: float | Tensor, start: float
+    growth_d: Tensor,
+    d: Tensor,
+    virtual_scale: float | Tensor,
+    start: float,
 ) -> Tensor:
     """``[N]`` the factors g of the scales; exactly 1 where ``growth_d`` is 0 or ``d s <= r``.
 

@@ -48,7 +48,10 @@ def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfi
 
 @torch.no_grad()
 def normalizing_distance(
-    distances: Tensor, means: Tensor, camera: Camera, config: AttenuationConfig
+    distances: Tensor,
+    means: Tensor,
+    camera: Camera,
+    config: AttenuationConfig,
 ) -> Tensor:
     """0-d, D, world units, > 0: ``config.scene_distance``, in the paper's form the largest distance
     in the view.

@@ -25,7 +25,10 @@ def decay(sigma_d: Tensor, far: Tensor) -> Tensor:
 
 
 def paper_fade(
-    opacities: Tensor, sigma_d: Tensor, far: Tensor, virtual_scale: float
+    opacities: Tensor,
+    sigma_d: Tensor,
+    far: Tensor,
+    virtual_scale: float,
 ) -> tuple[Tensor, Tensor]:
     """``exp(-u)`` where a'' is above the threshold, else 0, differentiable in ``sigma_d``; and
     which are kept.
@@ -36,7 +39,11 @@ def paper_fade(
 
 
 def soft_count(
-    opacity_logits: Tensor, sigma_d: Tensor, far: Tensor, virtual_scale: float, width: float
+    opacity_logits: Tensor,
+    sigma_d: Tensor,
+    far: Tensor,
+    virtual_scale: float,
+    width: float,
 ) -> Tensor:
     """0-d, the share of Gaussians kept, in [0, 1], differentiable in logits and ``sigma_d``; 0 for
     no Gaussians.

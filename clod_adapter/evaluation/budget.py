@@ -136,7 +136,10 @@ def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValu
 
 
 def frame_times(
-    gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    *,
+    progress: Listener | None = None,
 ) -> tuple[list[tuple[float, float]], list[str]]:
     """Measures milliseconds per frame at six dial values up to max_sv, in even steps of log s; and
     notes on that.
@@ -166,7 +169,10 @@ def _for_psnr_drop(quality_table: QualityTable | None, drop: float) -> DialValue
 
 @torch.no_grad()
 def _for_count(
-    gaussians: Gaussians, cameras: Sequence[Place], baked: bool, keep: float
+    gaussians: Gaussians,
+    cameras: Sequence[Place],
+    baked: bool,
+    keep: float,
 ) -> DialValue:
     """Counts Gaussians at their distances from each camera, or with ``baked`` at one distance over
     all cameras.

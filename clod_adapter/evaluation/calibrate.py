@@ -49,7 +49,11 @@ def with_frame_times(
 
 
 def make_quality_table(
-    rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin
+    rows: Sequence[Row],
+    measured: Gaussians,
+    scene: Scene,
+    against: str,
+    origin: Origin,
 ) -> QualityTable:
     """The quality table of rows measured on this machine.
 

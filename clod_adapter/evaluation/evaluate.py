@@ -145,7 +145,9 @@ def _row(virtual_scale: float, measured: Sequence[_Measured], total: int) -> Row
 
 
 def _measured(
-    gaussians: Gaussians, views: Sequence[View], virtual_scale: float
+    gaussians: Gaussians,
+    views: Sequence[View],
+    virtual_scale: float,
 ) -> Iterator[_Measured]:
     """Renders each view; PSNR and SSIM are computed of several at a time."""
     workers = min(torch.get_num_threads(), SCORED)

@@ -64,7 +64,9 @@ class FrameTimes:
 
 @torch.no_grad()
 def time_frames(
-    models: Sequence[Model], cameras: Sequence[Camera], progress: Listener | None = None
+    models: Sequence[Model],
+    cameras: Sequence[Camera],
+    progress: Listener | None = None,
 ) -> FrameTimes:
     """Times frames from at most three of the cameras, evenly spread."""
     if not cameras:
@@ -107,7 +109,9 @@ def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> floa
 
 
 def timed_frame(
-    gaussians: Gaussians, camera: Camera, virtual_scale: float
+    gaussians: Gaussians,
+    camera: Camera,
+    virtual_scale: float,
 ) -> tuple[Rendering, float]:
     """A rendering, and the seconds that it took, the device's work included."""
     wait_for(gaussians.means.device)

@@ -65,7 +65,9 @@ class Popping:
 
 @torch.no_grad()
 def sweep(
-    show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Listener | None = None
+    show: Callable[[int, int], Tensor],
+    positions: Sequence[float],
+    progress: Listener | None = None,
 ) -> Popping:
     """Measures images: ``show(k, j)`` is that ``[H, W, 3]`` from the camera of step k with the
     Gaussians of step j.

@@ -68,7 +68,10 @@ def adapt_at_range(
 
 
 def baseline(
-    base: Gaussians, views: Sequence[View], shares: Sequence[float], progress: Listener
+    base: Gaussians,
+    views: Sequence[View],
+    shares: Sequence[float],
+    progress: Listener,
 ) -> CellResult:
     """The unadapted base with only its most opaque Gaussians: one row per share."""
     base = detach(base)

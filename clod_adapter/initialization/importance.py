@@ -60,7 +60,10 @@ def initialize(
 
 
 def importance(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None
+    base: Gaussians,
+    views: Sequence[View],
+    config: AdaptConfig,
+    progress: Listener | None = None,
 ) -> Tensor:
     """``[N]`` the weight of each Gaussian in the pictures: the root of its ``removal_error``, times
     its opacity.
@@ -69,7 +72,10 @@ def importance(
 
 
 def reach_of(
-    order: Tensor, distances: Tensor, config: AdaptConfig, total: int | None = None
+    order: Tensor,
+    distances: Tensor,
+    config: AdaptConfig,
+    total: int | None = None,
 ) -> Tensor:
     """``[N]`` sigma_d from the pruning order, in the unit of the typical ``distances [N]``;
     ``total`` as for ``extinction_from_rank``.
@@ -79,7 +85,9 @@ def reach_of(
 
 
 def with_growth(
-    initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None = None
+    initial: Gaussians,
+    config: AdaptConfig,
+    growth_d: Tensor | None = None,
 ) -> Gaussians:
     """``initial`` with ``growth_d``, by default 0; without one if the config has no growth."""
     if config.growth == "off":
@@ -136,7 +144,11 @@ def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
 
 
 def removal_error(
-    gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Listener | None = None
+    gaussians: Gaussians,
+    views: Sequence[View],
+    *,
+    seed: int = 0,
+    progress: Listener | None = None,
 ) -> Tensor:
     """``[N]`` estimate of the squared image error of removing each Gaussian alone, mean over the
     views.
@@ -187,7 +199,10 @@ def extinction_from_rank(rank: Tensor, config: AdaptConfig, total: int | None = 
 
 
 def coverage(
-    gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None
+    gaussians: Gaussians,
+    opacities: Tensor,
+    camera: Camera,
+    growth: Tensor | None = None,
 ) -> Tensor:
     """``[N]`` pixels that each Gaussian covers: the gradient of the image by its colour."""
     grey = gaussians.sh0.new_zeros(gaussians.sh0.shape).requires_grad_()

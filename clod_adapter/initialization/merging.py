@@ -65,7 +65,10 @@ class Mixture:
 
 @np.errstate(under="ignore")
 def merge(
-    gaussians: Gaussians, importance: Tensor, count: int, progress: Listener | None = None
+    gaussians: Gaussians,
+    importance: Tensor,
+    count: int,
+    progress: Listener | None = None,
 ) -> Gaussians:
     """About ``count`` Gaussians, without a dial, that stand for all of them; themselves if there
     are no more.

@@ -20,7 +20,9 @@ STUCK = 0.02
 
 
 def pruning_order(
-    gaussians: Gaussians, importance: Tensor, progress: Listener | None = None
+    gaussians: Gaussians,
+    importance: Tensor,
+    progress: Listener | None = None,
 ) -> Tensor:
     """``[N]`` int64, the number of Gaussians removed before each: half-edge collapse, as for the
     levels of a mesh.
@@ -74,7 +76,9 @@ def _removed(cost: np.ndarray, substitute: np.ndarray) -> np.ndarray:
 
 
 def _substitutes(
-    centres: np.ndarray, colours: np.ndarray, sizes: np.ndarray
+    centres: np.ndarray,
+    colours: np.ndarray,
+    sizes: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The most similar neighbour of each, and its dissimilarity."""
     substitute = np.empty(len(centres), np.int64)

@@ -81,7 +81,11 @@ class ForwardState:
     """State of the forward pass for the backward pass: projection, depth order and tile lists."""
 
     def __init__(
-        self, stored: Stored, camera: Camera, screen_filter: ScreenFilter, dial: Dial
+        self,
+        stored: Stored,
+        camera: Camera,
+        screen_filter: ScreenFilter,
+        dial: Dial,
     ) -> None:
         n = len(stored.means)
         workers = workers_for(n)
@@ -141,7 +145,11 @@ class ForwardState:
         return image, alpha
 
     def blend_gradient(
-        self, picture: Picture, gradients: Picture, shaped: bool, colored: bool
+        self,
+        picture: Picture,
+        gradients: Picture,
+        shaped: bool,
+        colored: bool,
     ) -> np.ndarray:
         """The sums over pixels of each pair of Gaussian and tile, those of shape and colour if
         asked for.

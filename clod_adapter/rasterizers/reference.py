@@ -50,7 +50,12 @@ def rasterize(
 
 
 def project(
-    points: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, camera: Camera
+    points: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    camera: Camera,
 ) -> tuple[Tensor, Tensor]:
     """Image centres ``[n, 2]`` and P ``[n, 2, 3]`` of covariances P P^T by the local affine
     approximation (EWA).

@@ -172,7 +172,11 @@ def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: flo
 
 
 def _line(
-    axes: Any, k: int, label: str, points: Sequence[tuple[float, float]], linestyle: str = "-"
+    axes: Any,
+    k: int,
+    label: str,
+    points: Sequence[tuple[float, float]],
+    linestyle: str = "-",
 ) -> None:
     colour = SERIES[k % len(SERIES)]
     marker = MARKERS[k % len(MARKERS)]

@@ -101,7 +101,9 @@ def write_page(
 
 
 def _draws(
-    series: Sequence[charts.Series], training: Mapping[str, Any] | None, against_base: bool
+    series: Sequence[charts.Series],
+    training: Mapping[str, Any] | None,
+    against_base: bool,
 ) -> dict[str, charts.Draw]:
     """The functions that draw the charts, by name."""
     draws: dict[str, charts.Draw] = {}

@@ -108,7 +108,11 @@ class _Placement:
     """Rounds of cameras for one checkpoint, each for what the cameras before do not show."""
 
     def __init__(
-        self, plain: Gaussians, seed: int, field: float, progress: Listener | None
+        self,
+        plain: Gaussians,
+        seed: int,
+        field: float,
+        progress: Listener | None,
     ) -> None:
         usable = _usable(plain)
         self.sample, self.growth = _sample(plain, usable, seed)

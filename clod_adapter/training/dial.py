@@ -74,7 +74,11 @@ class Dial(nn.Module):
         def __call__(self, camera: Camera, virtual_scale: float) -> Attenuated: ...
 
     def __init__(
-        self, splats: Splats, start: Gaussians, cameras: Sequence[Camera], config: AdaptConfig
+        self,
+        splats: Splats,
+        start: Gaussians,
+        cameras: Sequence[Camera],
+        config: AdaptConfig,
     ) -> None:
         super().__init__()
         assert start.sigma_d is not None and start.attenuation is not None
@@ -201,7 +205,10 @@ class Dial(nn.Module):
         return max(1 - self.weight_slope * virtual_scale / self.config.max_sv, 0.0) ** 2
 
     def counts(
-        self, virtual_scale: float, counted: float | None, loss: Tensor
+        self,
+        virtual_scale: float,
+        counted: float | None,
+        loss: Tensor,
     ) -> list[tuple[float, Tensor]]:
         """The dial values, from 1 on, at which Gaussians are counted, and the losses that weigh the
         count term there.
@@ -217,7 +224,11 @@ class Dial(nn.Module):
         return terms
 
     def objective(
-        self, loss: Tensor, gaussians: Gaussians, camera: Camera, virtual_scale: float
+        self,
+        loss: Tensor,
+        gaussians: Gaussians,
+        camera: Camera,
+        virtual_scale: float,
     ) -> Tensor:
         """0-d, what ``adapt`` differentiates: the weighted photometric ``loss`` of a rendering."""
         return self.weight(virtual_scale) * loss
@@ -326,7 +337,10 @@ def attach(
 
 
 def require_trainable(
-    base: Gaussians, scene: Scene, config: AdaptConfig, processes: int = 1
+    base: Gaussians,
+    scene: Scene,
+    config: AdaptConfig,
+    processes: int = 1,
 ) -> None:
     """Raises ClodError if there is nothing to train, or on nothing, or a value is not finite."""
     if not scene.train:

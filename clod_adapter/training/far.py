@@ -56,7 +56,10 @@ WITHOUT_FAR = (
 
 
 def with_far(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None
+    base: Gaussians,
+    views: Sequence[View],
+    config: AdaptConfig,
+    progress: Listener | None = None,
 ) -> Gaussians:
     """The base's Gaussians as near ones, and after them far ones with an initial reach; in world
     units.

@@ -37,7 +37,9 @@ PRECISION = 1e-3  # of the dial value that meets a budget
 
 @torch.no_grad()
 def fit_far_reach(
-    gaussians: Gaussians, views: Sequence[View], progress: Listener | None = None
+    gaussians: Gaussians,
+    views: Sequence[View],
+    progress: Listener | None = None,
 ) -> Gaussians:
     """The Gaussians with the reach of far ones whose pictures differ least from those of the views.
 

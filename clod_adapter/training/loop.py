@@ -108,7 +108,10 @@ def adapt(
 
 
 def time_steps(
-    start: Gaussians, scene: Scene, config: AdaptConfig, steps: int
+    start: Gaussians,
+    scene: Scene,
+    config: AdaptConfig,
+    steps: int,
 ) -> tuple[float, float]:
     """Seconds of a step of ``adapt``, as the mean of ``steps`` over the schedule, and of all beside
     the steps.

@@ -84,7 +84,10 @@ class RowAdam:
             self._step_plain(gradients, rows, rates)
 
     def _step_fused(
-        self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]
+        self,
+        gradients: dict[str, Tensor],
+        rows: Tensor,
+        rates: dict[str, float],
     ) -> None:
         from clod_adapter._kernels import threads
         from clod_adapter._kernels.adam import adam_rows
@@ -105,7 +108,10 @@ class RowAdam:
         threads.run(adam, threads.worker_count())
 
     def _step_plain(
-        self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]
+        self,
+        gradients: dict[str, Tensor],
+        rows: Tensor,
+        rates: dict[str, float],
     ) -> None:
         """The plain twin of the fused step: all rows, without asking which (a GPU would have to
         answer first).

@@ -71,7 +71,11 @@ class PaperDial(Dial):
         return sigma_d.detach().float().clamp(*SIGMA_RANGE)
 
     def objective(
-        self, loss: Tensor, gaussians: Gaussians, camera: Camera, virtual_scale: float
+        self,
+        loss: Tensor,
+        gaussians: Gaussians,
+        camera: Camera,
+        virtual_scale: float,
     ) -> Tensor:
         if self.config.reg_weight > 0 and virtual_scale >= 1:
             loss = loss + self.count_term(gaussians, camera, virtual_scale)

@@ -82,7 +82,10 @@ def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
 
 
 def _sh_degree(
-    base: Gaussians, views: Sequence[View], override: Override, progress: Listener | None
+    base: Gaussians,
+    views: Sequence[View],
+    override: Override,
+    progress: Listener | None,
 ) -> tuple[int, list[Decision]]:
     """The SH degree to train with."""
     highest = base.sh_degree
@@ -135,7 +138,9 @@ def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> 
 
 @torch.no_grad()
 def sh_degree_losses(
-    base: Gaussians, views: Sequence[View], limit: float
+    base: Gaussians,
+    views: Sequence[View],
+    limit: float,
 ) -> Iterator[tuple[int, float]]:
     """Effect of removing the highest SH degrees: (degree, dB without it and those above), from the
     highest down.

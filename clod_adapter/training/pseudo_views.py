@@ -47,7 +47,11 @@ class PseudoView(StoredView):
     """
 
     def __init__(
-        self, camera: Camera, supervision: Gaussians, reach: float, backed: float = 0.0
+        self,
+        camera: Camera,
+        supervision: Gaussians,
+        reach: float,
+        backed: float = 0.0,
     ) -> None:
         super().__init__(camera, lambda: render(supervision, camera).pixels.cpu())
         self.__dict__.update(supervision=supervision, reach=reach, backed=backed)
@@ -84,7 +88,10 @@ def only_pseudo(views: Sequence[View]) -> bool:
 
 @torch.no_grad()
 def render_pseudo_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    *,
+    progress: Listener | None = None,
 ) -> Scene:
     """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held
     out.
@@ -120,7 +127,10 @@ def render_pseudo_views(
 
 
 def with_pseudo_views(
-    gaussians: Gaussians, scene: Scene | None, seed: int = 0, progress: Listener | None = None
+    gaussians: Gaussians,
+    scene: Scene | None,
+    seed: int = 0,
+    progress: Listener | None = None,
 ) -> Scene:
     """The scene with pseudo views beside few photographs, or, for None, of pseudo views at placed
     cameras alone.
@@ -135,7 +145,10 @@ def with_pseudo_views(
 
 
 def add_pseudo_views(
-    gaussians: Gaussians, scene: Scene, seed: int = 0, progress: Listener | None = None
+    gaussians: Gaussians,
+    scene: Scene,
+    seed: int = 0,
+    progress: Listener | None = None,
 ) -> Scene:
     """Adds ADDED pseudo views where there are few photographs.
 
@@ -173,7 +186,11 @@ def add_pseudo_views(
 
 
 def _views(
-    supervision: Gaussians, cameras: Sequence[Camera], *, wider: float = 1.0, backed: float = 0.0
+    supervision: Gaussians,
+    cameras: Sequence[Camera],
+    *,
+    wider: float = 1.0,
+    backed: float = 0.0,
 ) -> list[PseudoView]:
     pairs = zip(cameras, reaches(supervision, cameras), strict=True)
     return [PseudoView(camera, supervision, wider * reach, backed) for camera, reach in pairs]

@@ -76,7 +76,10 @@ class ViewSampler:
     """
 
     def __init__(
-        self, views: tuple[View, ...], config: AdaptConfig, schedule: Schedule = OURS
+        self,
+        views: tuple[View, ...],
+        config: AdaptConfig,
+        schedule: Schedule = OURS,
     ) -> None:
         self.views = views
         self.max_sv = config.max_sv

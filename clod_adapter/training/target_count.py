@@ -29,7 +29,10 @@ def target_curve(virtual_scale: float, share: float, exponent: float) -> float:
 
 
 def target_share(
-    virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None
+    virtual_scale: float,
+    count: int,
+    config: AdaptConfig,
+    total: int | None = None,
 ) -> float:
     """The share to keep of ``count`` of ``total`` Gaussians (all if None): ``target_curve``, but at
     least one.

@@ -327,7 +327,10 @@ def policy(connect: str = "") -> str:
 
 
 def document(
-    config: Mapping[str, Any], data: Iterable[bytes] = (), meta: str = "", poster: str = ""
+    config: Mapping[str, Any],
+    data: Iterable[bytes] = (),
+    meta: str = "",
+    poster: str = "",
 ) -> Iterator[bytes]:
     """The page in pieces, because data may be large; ``meta`` is added to its head, ``poster``
     above its canvas.
