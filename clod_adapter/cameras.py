@@ -112,7 +112,12 @@ def looking(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
     """``[3, 3]`` float32 K of focal lengths and principal point, pixels."""
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float32)
+    rows = [
+        [fx, 0, cx],
+        [0, fy, cy],
+        [0, 0, 1],
+    ]
+    return torch.tensor(rows, dtype=torch.float32)
 
 
 def numbers_of(name: str, values: Any) -> Tensor:

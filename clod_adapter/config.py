@@ -150,7 +150,10 @@ class ScreenFilter:
     """
 
     variance: float = option(
-        0.3, "px^2 added to the covariance of every projected Gaussian", low=1e-3, high=100
+        0.3,
+        "px^2 added to the covariance of every projected Gaussian",
+        low=1e-3,
+        high=100,
     )
     compensate: bool = option(
         False, "whether opacities are scaled by c to compensate for the widening"
@@ -209,7 +212,10 @@ class AdaptConfig:
         high=1e9,
     )
     batch: int = option(
-        1, "views per step; learning rates scale with its square root", low=1, high=4096
+        1,
+        "views per step; learning rates scale with its square root",
+        low=1,
+        high=4096,
     )
     time_budget: float | None = option(
         None,
@@ -217,13 +223,20 @@ class AdaptConfig:
         low=1e-3,
     )
     seed: int = option(
-        0, "seed of the view order, the dial values and the importance estimate", high=2**63 - 1
+        0,
+        "seed of the view order, the dial values and the importance estimate",
+        high=2**63 - 1,
     )
     start_share: float = option(
-        0.62, "share of Gaussians to keep at s = 1 where there are no far ones", low=0.501, high=1
+        0.62,
+        "share of Gaussians to keep at s = 1 where there are no far ones",
+        low=0.501,
+        high=1,
     )
     exponent: float = option(
-        1.5, "target-count curve: the target share of Gaussians at s is s^-exponent", low=1e-3
+        1.5,
+        "target-count curve: the target share of Gaussians at s is s^-exponent",
+        low=1e-3,
     )
     reg_weight: float = option(1.0, "weight of the count loss (the paper's lambda_reg)")
     ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w", high=1)

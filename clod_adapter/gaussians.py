@@ -233,10 +233,11 @@ class LossNotFinite(Exception):
 
 def nonfinite_rows(*tensors: Tensor) -> Tensor:
     """``[N]`` bool, the rows with a value that is not finite in any of the tensors ``[N, ...]``."""
-    # sums take one pass without extra memory
-    if tensors[0].device.type == "cpu" and all(bool(tensor.sum().isfinite()) for tensor in tensors):
-        # A GPU is not asked: the host would wait for its answer.
-        return torch.zeros(len(tensors[0]), dtype=torch.bool, device="cpu")
+    if tensors[0].device.type == "cpu":  # the host would wait for a GPU's answer
+        # sums take one pass without extra memory
+        sums = [tensor.sum() for tensor in tensors]
+        if all(bool(total.isfinite()) for total in sums):
+            return torch.zeros(len(tensors[0]), dtype=torch.bool, device="cpu")
     rows = []
     for tensor in tensors:
         finite = tensor.isfinite().reshape(len(tensor), tensor.shape[1:].numel())

@@ -103,7 +103,8 @@ def unit(photograph: Tensor, like: Tensor) -> Tensor:
     """A uint8 photograph in [0, 1], of the type and on the device of ``like``; transferred as
     bytes.
     """
-    return photograph.to(like.device, non_blocking=like.device.type != "cpu").to(like.dtype) / 255
+    on_device = photograph.to(like.device, non_blocking=like.device.type != "cpu")
+    return on_device.to(like.dtype) / 255
 
 
 class _FusedLoss(torch.autograd.Function):

@@ -153,7 +153,11 @@ def with_quality_table(result: Result, note: Note) -> Result:
     """The result with the quality table of its rows in its adapter, or a note without one."""
     try:
         quality_table = make_quality_table(
-            result.rows, result.gaussians, result.scene, result.against, result.base.origin
+            result.rows,
+            result.gaussians,
+            result.scene,
+            result.against,
+            result.base.origin,
         )
     except ClodError as error:
         note(f"the files have no quality table, so --fps and --psnr-drop will not work: {error}")

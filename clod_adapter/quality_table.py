@@ -76,7 +76,8 @@ class Viewpoint:
 
     def moved(self, by: Sequence[float]) -> Viewpoint:
         """A copy with its centre moved by ``by [3]``, world units."""
-        return replace(self, x=self.x + by[0], y=self.y + by[1], z=self.z + by[2])
+        x, y, z = by
+        return replace(self, x=self.x + x, y=self.y + y, z=self.z + z)
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,11 @@ class QualityTable:
         against = str(values.get("against", AGAINST[0]))
         viewpoints = tuple(Viewpoint(**_floats(row)) for row in values.get("viewpoints", ()))
         return cls(
-            rows, machine=str(values["machine"]), against=against, viewpoints=viewpoints, **counts
+            rows,
+            machine=str(values["machine"]),
+            against=against,
+            viewpoints=viewpoints,
+            **counts,
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -88,7 +88,10 @@ def render(
     """
     for name, value, kind in (("gaussians", gaussians, Gaussians), ("camera", camera, Camera)):
         require(
-            isinstance(value, kind), name, f"a {type(value).__name__}", f"of type {kind.__name__}"
+            isinstance(value, kind),
+            name,
+            f"a {type(value).__name__}",
+            f"of type {kind.__name__}",
         )
     if gaussians.sigma_d is None:
         warn_of_no_dial(virtual_scale, "give the result of clod_adapter.adapt")

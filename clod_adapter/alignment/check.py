@@ -96,6 +96,7 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     if not len(table):
         return Alignment(0, in_view, *[math.nan] * 5)
     error, over_white, constant = table.mean(0).tolist()[:3]
+    better = table[:, 0] < table[:, 2]
     return Alignment(
         views=len(table),
         in_view=in_view,
@@ -103,7 +104,7 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
         mean_colour_psnr=decibels(constant),
         white_psnr=decibels(over_white),
         correlation=correlation(table),
-        explained=float((table[:, 0] < table[:, 2]).float().mean()),
+        explained=float(better.float().mean()),
     )
 
 

@@ -25,6 +25,13 @@ NERFSTUDIO = (
 )
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 ROUNDS = 20  # of the reweighted least squares
+# Of principal axes, which have none: those that turn, and do not mirror.
+SIGNS = (
+    (1.0, 1, 1),
+    (1.0, -1, -1),
+    (-1.0, 1, -1),
+    (-1.0, -1, 1),
+)
 # Rotations of COLMAP's world in nerfstudio's readers before normalization: none, the current one,
 # the older one.
 NERFSTUDIO_TURNS = (
@@ -94,9 +101,11 @@ def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
     """The frames that follow from all cameras ``[V, 4, 4]`` and the scene's points, by which
     trainers normalize.
     """
-    identity = torch.eye(3, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64)
+    turn = torch.eye(3, dtype=torch.float64)
+    offset = torch.zeros(3, dtype=torch.float64)
     poses = [
-        Frame(name, text, *identity, inverted, opengl) for name, inverted, opengl, text in POSES
+        Frame(name, text, turn, 1.0, offset, inverted, opengl)
+        for name, inverted, opengl, text in POSES
     ]
     return [*poses, *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
 
@@ -191,8 +200,7 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     covariance = (turned - middle).T.cov()
     axes = torch.linalg.eigh(covariance).eigenvectors.flip(1).T
     axes = axes * torch.linalg.det(axes).sign()
-    # eigenvectors have no sign
-    for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):
+    for signs in SIGNS:
         turn = torch.diag(viewmats.new_tensor(signs)) @ axes
         yield _normalized("gsplat", GSPLAT, turn @ rotation, 1 / distance, -turn @ middle)
 

@@ -182,10 +182,13 @@ def kept_between(
     config = gaussians.attenuation
     assert gaussians.sigma_d is not None and config is not None
     d = distances.double()
-    begin, end = torch.zeros_like(d), (gaussians.sigma_d.double() / d).masked_fill(d == 0, math.inf)
-    if (near := gaussians.near) is None:
+    begin = torch.zeros_like(d)
+    end = (gaussians.sigma_d.double() / d).masked_fill(d == 0, math.inf)
+    near = gaussians.near
+    if near is None:
         return begin, end
-    first, last = (takeover_distance(config, share) for share in ((0.5, 0.5) if baked else (0, 1)))
+    shares = (0.5, 0.5) if baked else (0, 1)
+    first, last = (takeover_distance(config, share) for share in shares)
     return torch.where(near, begin, first / d), torch.where(near, last / d, end)
 
 

@@ -89,4 +89,6 @@ def _interest(view: View) -> float:
     behind a wall, where contrasts are blurred.
     """
     image = view.image.float().mean(2)
-    return float(image.diff(dim=0).square().mean() + image.diff(dim=1).square().mean())
+    down = image.diff(dim=0).square().mean()
+    across = image.diff(dim=1).square().mean()
+    return float(down + across)

@@ -157,7 +157,8 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
     rotations = Slerp(places, Rotation.from_matrix(poses[:, :3, :3]))
     moved = np.tile(np.eye(4), (steps + 1, 1, 1))
     moved[:, :3, :3] = rotations(at).as_matrix()
-    moved[:, :3, 3] = np.stack([np.interp(at, places, axis) for axis in centres.T], 1)
+    for axis in range(3):
+        moved[:, axis, 3] = np.interp(at, places, centres[:, axis])
     path_viewmats = torch.from_numpy(np.linalg.inv(moved)).to(first.viewmat)
     return [replace(first, viewmat=viewmat) for viewmat in path_viewmats]
 

@@ -134,7 +134,8 @@ def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
     remaining = len(mixture)
     for first, second in _cheapest(mixture, weights):
         pairs = slice(remaining - count)
-        partner[first[pairs]], partner[second[pairs]] = second[pairs], first[pairs]
+        partner[first[pairs]] = second[pairs]
+        partner[second[pairs]] = first[pairs]
         remaining -= len(first[pairs])
         if remaining <= count:
             break
@@ -189,7 +190,8 @@ def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray
         j = second[block]
         p = mixture.mass[i] / (mixture.mass[i] + mixture.mass[j])
         q = 1 - p
-        between = _products(np.sqrt(p * q)[:, None] * (mixture.means[i] - mixture.means[j]))
+        apart = mixture.means[i] - mixture.means[j]
+        between = _products(np.sqrt(p * q)[:, None] * apart)
         merged = (
             p[:, None, None] * mixture.covariances[i]
             + q[:, None, None] * mixture.covariances[j]

@@ -111,5 +111,6 @@ def _most_similar(
             dissimilarity += APART * distance / np.maximum(distance + reach, np.finfo(float).tiny)
             dissimilarity = np.nan_to_num(dissimilarity, nan=DIFFERENT, posinf=DIFFERENT)
             better = (dissimilarity < least) & (neighbour != rows)
-            substitute[better], least[better] = neighbour[better], dissimilarity[better]
+            substitute[better] = neighbour[better]
+            least[better] = dissimilarity[better]
     return substitute, least

@@ -262,7 +262,14 @@ class _Compiled(Rasterizer):
             len(g) if trained is None else trained,
             background,
             *Stored(
-                g.means, g.quats, g.log_scales, g.opacity_logits, sigma_d, growth_d, g.sh0, g.shN
+                g.means,
+                g.quats,
+                g.log_scales,
+                g.opacity_logits,
+                sigma_d,
+                growth_d,
+                g.sh0,
+                g.shN,
             ),
         )
 

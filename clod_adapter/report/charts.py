@@ -220,7 +220,12 @@ def _finish(axes: Any, label: str) -> None:
     right.yaxis.set_major_formatter(ScalarFormatter())
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, borderaxespad=0)
     axes.annotate(
-        "better", (0.012, 0.018), xycoords="axes fraction", fontsize=8, color=QUIET, style="italic"
+        "better",
+        (0.012, 0.018),
+        xycoords="axes fraction",
+        fontsize=8,
+        color=QUIET,
+        style="italic",
     )
 
 

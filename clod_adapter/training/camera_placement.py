@@ -204,7 +204,8 @@ class _Placement:
         for camera in cameras:
             pixels = coverage(self.sample, self.sample.opacities, camera, self.growth)
             self.hidden *= pixels * (WIDTH / camera.width) ** 2 < COVERED
-        return 1 - float((self.weight * self.hidden).sum() / self.weight.sum())
+        hidden = (self.weight * self.hidden).sum()
+        return 1 - float(hidden / self.weight.sum())
 
 
 def _usable(gaussians: Gaussians) -> Tensor:
@@ -223,7 +224,9 @@ def _usable(gaussians: Gaussians) -> Tensor:
 def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
     """A camera for scoring. The up direction is unknown; COLMAP's y axis usually points down."""
     forward = F.normalize(target - eye, dim=0)
-    axis = [0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.99 else [0.0, 0.0, 1.0]
+    axis = [0.0, 1.0, 0.0]
+    if abs(float(forward[1])) >= 0.99:
+        axis = [0.0, 0.0, 1.0]
     down = torch.tensor(axis, dtype=torch.float32)
     near = near_plane(float((target - eye).norm()))
     return Camera(looking(eye, forward, down), _intrinsics(zoom, *LOOK), *LOOK, near=near)
@@ -271,9 +274,11 @@ def _score(gaussians: Gaussians, growth: Tensor, camera: Camera, reach: float) -
     """
     depths = camera.depths(gaussians.means).clamp(min=1e-6)
     pixels = gaussians.scales.amax(1) * WIDTH / camera.width * camera.K[0, 0] / depths
-    # positive, as colours are, and three; the last is not read
-    shades = torch.stack([pixels, depths / reach, depths], 1).clamp(1e-3, 1e4).log() + 7
-    plain = gaussians.replace(sh0=(shades[:, None] - 0.5) / SH_C0, shN=gaussians.shN[:, :0])
+    # three, as colours are; the last is not read
+    values = torch.stack([pixels, depths / reach, depths], 1)
+    shades = values.clamp(1e-3, 1e4).log() + 7  # positive, as colours are
+    sh0 = (shades[:, None] - 0.5) / SH_C0
+    plain = gaussians.replace(sh0=sh0, shN=gaussians.shN[:, :0])
     shaded, alpha = splat(plain, gaussians.opacities, camera, growth=growth)
     covered = float(alpha.sum())
     if covered < 0.1 * alpha.numel():
@@ -287,8 +292,10 @@ def _score(gaussians: Gaussians, growth: Tensor, camera: Camera, reach: float) -
         # the colour is then 0.5 + that of the higher degrees
         higher = gaussians.replace(sh0=torch.zeros_like(gaussians.sh0))
         bands, _ = splat(higher, gaussians.opacities, camera, growth=growth)
-        strength = float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered
-    return math.log(strength + 1e-4) - 0.5 * size - 2 * _empty(alpha) - 1.5 * _empty(alpha_behind)
+        magnitudes = (bands - 0.5 * alpha[..., None]).abs().mean(2)
+        strength = float(magnitudes.sum()) / covered
+    emptiness = 2 * _empty(alpha) + 1.5 * _empty(alpha_behind)
+    return math.log(strength + 1e-4) - 0.5 * size - emptiness
 
 
 def _opposite(camera: Camera) -> Camera:

@@ -245,9 +245,12 @@ class Dial(nn.Module):
         loss = torch.as_tensor(rendering_loss).detach().double()
         gradient = self.count_gradient(self.log_sigma.detach(), virtual_scale, loss)
         sigma = self.sigma_d.detach()
-        eta = reach_fade(sigma, self.typical.double() * virtual_scale)[1].sum() / len(sigma)
-        value = loss * self.config.reg_weight * (eta / self.target_share(virtual_scale) - 1) ** 2
-        return value.to(sigma) + ((self.log_sigma - self.log_sigma.detach()) * gradient).sum()
+        _, keep = reach_fade(sigma, self.typical.double() * virtual_scale)
+        eta = keep.sum() / len(sigma)
+        excess = eta / self.target_share(virtual_scale) - 1
+        value = loss * self.config.reg_weight * excess**2
+        change = self.log_sigma - self.log_sigma.detach()  # 0, with a gradient
+        return value.to(sigma) + (change * gradient).sum()
 
     @torch.no_grad()
     def count_gradient(self, parameter: Tensor, virtual_scale: float, loss: Tensor) -> Tensor:
@@ -280,7 +283,9 @@ class Dial(nn.Module):
                 " densification and pruning"
             )
         return current.replace(
-            sigma_d=self.sigma_d, attenuation=self.attenuation, growth_d=self.growth_d
+            sigma_d=self.sigma_d,
+            attenuation=self.attenuation,
+            growth_d=self.growth_d,
         )
 
     @torch.no_grad()
@@ -328,7 +333,8 @@ def attach(
         for item in (scene.train if isinstance(scene, Scene) else scene)
     )
     base = splats if isinstance(splats, Gaussians) else from_gsplat(splats)
-    base = base.replace(**{name: value.detach() for name, value in base.tensors().items()})
+    constants = {name: value.detach() for name, value in base.tensors().items()}
+    base = base.replace(**constants)
     require_trainable(base, Scene(views, ()), config)
     views = usable_views(base, views)
     with progress_bar(progress) as listener:

@@ -88,7 +88,11 @@ class PaperDial(Dial):
             normalized_distances(gaussians.means, camera, self.attenuation).double() * virtual_scale
         )
         count = soft_count(
-            gaussians.opacity_logits, gaussians.sigma_d, far, virtual_scale, SOFTNESS
+            gaussians.opacity_logits,
+            gaussians.sigma_d,
+            far,
+            virtual_scale,
+            SOFTNESS,
         )
         excess = (count - virtual_scale**-self.config.exponent).clamp(min=0)
         return self.config.reg_weight * (virtual_scale - 1) ** 2 * excess**2

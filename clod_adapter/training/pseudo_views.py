@@ -69,14 +69,21 @@ class PseudoView(StoredView):
         """
         x, y, z = TURNED * random.standard_normal(3)
         step = torch.eye(4, dtype=torch.float64)  # on the CPU, where cameras are placed
-        turn = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+        rows = [
+            [0, -z, y],
+            [z, 0, -x],
+            [-y, x, 0],
+        ]
+        turn = torch.tensor(rows, dtype=torch.float64)
         step[:3, :3] = turn.matrix_exp()
         step[:3, 3] = torch.from_numpy(MOVED * self.reach * random.standard_normal(3))
         zoom = math.exp(ZOOMED * (2 * random.random() - 1))
         viewmat = (step @ self.camera.viewmat.double()).to(self.camera.viewmat)
         if random.random() < self.backed:  # against the direction of view
             viewmat[2, 3] += self.reach * (FARTHER ** random.random() - 1)
-        K = self.camera.K * self.camera.K.new_tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
+        K = self.camera.K.clone()
+        K[0, 0] *= zoom
+        K[1, 1] *= zoom
         camera = replace(self.camera, viewmat=viewmat, K=K)
         return StoredView(camera, lambda: render(self.supervision, camera).pixels)
 

@@ -54,7 +54,13 @@ OURS = Schedule()
 FAR = replace(OURS, full=0.33, unattenuated=0.0, coarse=0.5)
 # One s ~ U(1, max_sv) a step, of whole photographs; no average of parameters.
 PAPER = Schedule(
-    full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0, even=True
+    full=0.0,
+    coarse=0.0,
+    lr_final=0.05,
+    average=0.0,
+    rendered=1.0,
+    counted=0.0,
+    even=True,
 )
 
 
