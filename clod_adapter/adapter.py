@@ -185,28 +185,17 @@ def extract(
         raise ClodError(
             "the adapted Gaussians have no sigma_d, and so no dial; give the result of adapt"
         )
-    updates = dict[str, Tensor]()
     added = dict[str, Tensor]()
     near = adapted
     if adapted.near is not None and base.near is None:
         near = adapted.select(adapted.near)
         far = adapted.select(~adapted.near)
         added = {name: _stored(getattr(far, name)) for name in ATTRIBUTES}
-    for name in ATTRIBUTES:
-        old = getattr(base, name).detach().float()
-        new = getattr(near, name).detach().float()
-        if old.shape != new.shape:
-            raise ClodError(
-                f"{name} is {kind_of(new)}, in the base {kind_of(old)}; give the Gaussians that"
-                " were adapted"
-            )
-        if not torch.equal(old, new):
-            updates[name] = _update(name, old, new).cpu()
     columns: Any = {name: _stored(column) for name, column in dial_tensors(adapted).items()}
     return Adapter(
         **columns,
         attenuation=adapted.attenuation,
-        updates=updates,
+        updates=_updates(base, near),
         base_fingerprint=fingerprint,
         config=dict(config),
         origin=origin,
@@ -254,6 +243,22 @@ def detach(gaussians: Gaussians) -> Gaussians:
 
 def _stored(values: Tensor) -> Tensor:
     return values.detach().float().cpu().clone()
+
+
+def _updates(base: Gaussians, adapted: Gaussians) -> dict[str, Tensor]:
+    """The update of each attribute that changed."""
+    updates = dict[str, Tensor]()
+    for name in ATTRIBUTES:
+        old = getattr(base, name).detach().float()
+        new = getattr(adapted, name).detach().float()
+        if old.shape != new.shape:
+            raise ClodError(
+                f"{name} is {kind_of(new)}, in the base {kind_of(old)}; give the Gaussians that"
+                " were adapted"
+            )
+        if not torch.equal(old, new):
+            updates[name] = _update(name, old, new).cpu()
+    return updates
 
 
 def _update(name: str, old: Tensor, new: Tensor) -> Tensor:

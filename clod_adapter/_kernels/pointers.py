@@ -194,7 +194,11 @@ def _lanes(builder, lanes, at):
     return [builder.gep(first, [ir.Constant(I64, k)]) for k in range(LANES)]
 
 
-@operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
+# of a table, the numbers of rows, its width, the first column, their count, lanes, and the first
+_of_rows = operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
+
+
+@_of_rows
 def load_rows(builder, source, rows, width, first, count, lanes, at):
     """``lanes[at + k]`` = column ``first + k`` of sixteen rows of ``source [*, width]``, for
     k < count <= 16.
@@ -208,7 +212,7 @@ def load_rows(builder, source, rows, width, first, count, lanes, at):
         builder.store(vector, address, align=4)
 
 
-@operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
+@_of_rows
 def store_rows(builder, destination, rows, width, first, count, lanes, at):
     """The inverse of ``load_rows``; of rows that are listed twice the last is stored."""
     mask = _first(builder, count)

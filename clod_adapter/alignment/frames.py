@@ -75,9 +75,9 @@ class Frame:
 
     name: str
     description: str  # cause and remedy, for messages
-    rotation: Tensor  # a mirrored frame has determinant -1
-    scale: float
-    offset: Tensor
+    rotation: Tensor = torch.eye(3, dtype=torch.float64)  # of a mirrored frame, determinant -1
+    scale: float = 1.0
+    offset: Tensor = torch.zeros(3, dtype=torch.float64)
     inverted: bool = False  # the poses given are camera to world
     opengl: bool = False  # the cameras look along -z with y up
 
@@ -101,10 +101,8 @@ def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
     """The frames that follow from all cameras ``[V, 4, 4]`` and the scene's points, by which
     trainers normalize.
     """
-    turn = torch.eye(3, dtype=torch.float64)
-    offset = torch.zeros(3, dtype=torch.float64)
     poses = [
-        Frame(name, text, turn, 1.0, offset, inverted, opengl)
+        Frame(name, text, inverted=inverted, opengl=opengl)
         for name, inverted, opengl, text in POSES
     ]
     return [*poses, *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
@@ -157,7 +155,7 @@ def _axes(viewmats: Tensor) -> Iterator[Frame]:
             f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without"
             " that rotation"
         )
-        yield Frame(f"axes {names}", text, rotation, 1.0, viewmats.new_zeros(3))
+        yield Frame(f"axes {names}", text, rotation)
 
 
 def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:

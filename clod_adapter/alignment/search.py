@@ -145,7 +145,7 @@ def _placed(scale: float, offset: Tensor) -> Frame:
     by = ", ".join(f"{value:.3g}" for value in offset.tolist())
     larger = f"{scale:.3g} times as large and " if abs(scale - 1) > 0.02 else ""
     description = f"the file should be {larger}moved by ({by}): export it in the cameras' frame"
-    return Frame("scale and offset", description, torch.eye(3, dtype=torch.float64), scale, offset)
+    return Frame("scale and offset", description, scale=scale, offset=offset)
 
 
 def _climb(

@@ -95,8 +95,11 @@ def merge(
 
 
 def mixture_of(gaussians: Gaussians) -> Mixture:
+    from scipy.spatial.transform import Rotation
+
     scales = float64_array(gaussians.log_scales.double().exp())
-    axes = _rotations(float64_array(gaussians.quats))
+    quats = float64_array(gaussians.quats)[:, [1, 2, 3, 0]]
+    axes = Rotation.from_quat(quats).as_matrix()
     covariances = np.einsum("nij,nj,nkj->nik", axes, scales**2, axes)
     mass = float64_array(gaussians.opacities) * _areas(scales) + np.finfo(np.float32).tiny
     coefficients = torch.cat([gaussians.sh0, gaussians.shN], 1).detach().float().cpu()
@@ -106,6 +109,8 @@ def mixture_of(gaussians: Gaussians) -> Mixture:
 
 def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
     """The Gaussians of a mixture, with the screen filter and the SH degree of ``like``."""
+    from scipy.spatial.transform import Rotation
+
     variances, axes = np.linalg.eigh(mixture.covariances)
     axes[np.linalg.det(axes) < 0, :, 0] *= -1
     scales = np.sqrt(np.maximum(variances, THINNEST**2))
@@ -113,7 +118,7 @@ def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
     harmonics = mixture.harmonics.reshape(len(mixture), -1, 3)
     arrays = {
         "means": mixture.means,
-        "quats": _quaternions(axes),
+        "quats": Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]],
         "log_scales": np.log(scales),
         "opacity_logits": np.log(opacities / (1 - opacities)),
         "sh0": harmonics[:, :1],
@@ -219,15 +224,3 @@ def _areas(scales: np.ndarray) -> np.ndarray:
     x, y, z = scales.T
     sides = np.stack([x * y, x * z, y * z])
     return np.mean(sides**THOMSEN, 0) ** (1 / THOMSEN)
-
-
-def _rotations(quats: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
-
-
-def _quaternions(matrices: np.ndarray) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(matrices).as_quat()[:, [3, 0, 1, 2]]

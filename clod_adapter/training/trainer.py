@@ -85,22 +85,7 @@ class Trainer:
         self.count = self.dial.trained
         self.sampler = ViewSampler(views, config, self.dial.schedule)
         self.screen_filter = start.screen_filter
-        # The count term has a gradient of culled Gaussians too.
-        everywhere = (self.dial.decay, *self.dial.everywhere)
-        parameters_by_rows = {"kept": self.trained(), "all": dict[str, Tensor]()}
-        for name in everywhere:
-            parameters_by_rows["all"][name] = parameters_by_rows["kept"].pop(name)
-        units = {"means": own_sizes(start.log_scales[: self.count])}
-        self.optimizers = {
-            rows: RowAdam(
-                parameters,
-                beta1=BETA1**config.batch,
-                beta2=BETA2**config.batch,
-                units=units,
-            )
-            for rows, parameters in parameters_by_rows.items()
-            if parameters
-        }
+        self.optimizers = self._optimizers(own_sizes(start.log_scales[: self.count]))
         self.done = 0
         self.seconds = 0.0
         self.start_seconds = 0.0
@@ -109,6 +94,24 @@ class Trainer:
         self.averaged = 0
         self.ever_nonfinite = torch.zeros(self.count, dtype=torch.bool, device=start.means.device)
         self._updating = False
+
+    def _optimizers(self, sizes: Tensor) -> dict[str, RowAdam]:
+        """Those of the parameters that move where the dial keeps the row, and that move always: the
+        count term has a gradient of culled Gaussians too. ``sizes`` are units of the means.
+        """
+        parameters_by_rows = {"kept": self.trained(), "all": dict[str, Tensor]()}
+        for name in (self.dial.decay, *self.dial.everywhere):
+            parameters_by_rows["all"][name] = parameters_by_rows["kept"].pop(name)
+        return {
+            rows: RowAdam(
+                parameters,
+                beta1=BETA1**self.config.batch,
+                beta2=BETA2**self.config.batch,
+                units={"means": sizes},
+            )
+            for rows, parameters in parameters_by_rows.items()
+            if parameters
+        }
 
     @torch_on_one_thread()
     def step(self, share_done: float, until: float = math.inf) -> None:
