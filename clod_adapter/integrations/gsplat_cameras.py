@@ -19,7 +19,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.hook import Hook
 
 PER_ROW = ("sigma_d", "growth_d")
-PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "covars", *PER_ROW)
+PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "covars")
 PER_CAMERA = (
     "viewmats",
     "Ks",
@@ -62,17 +62,21 @@ def render(
             f"viewmats is {tuple(arguments['viewmats'].shape)}, of several scenes, and the dial's"
             " settings are of one; render one scene at a time"
         )
+    arguments = dict(arguments)
+    sigma_d, growth_d = (arguments.pop(name) for name in PER_ROW)
+    if growth_d is not None:
+        growth_d = growth_d.flatten()
+    hook = Hook(sigma_d.flatten(), config, virtual_scale, growth_d)
     results = []
     for of_camera in _cameras(arguments) if several else [arguments]:
-        results.append(_one_camera(function, of_camera, virtual_scale, config, hide))
+        results.append(_one_camera(function, of_camera, hook, hide))
     return _joined(results) if several else results[0]
 
 
 def _one_camera(
     function: Callable[..., Any],
     arguments: dict[str, Any],
-    virtual_scale: float,
-    config: AttenuationConfig,
+    hook: Hook,
     hide: bool,
 ) -> Any:
     """gsplat's result for a single camera with any batch dimensions."""
@@ -84,15 +88,11 @@ def _one_camera(
         near=arguments["near_plane"],
     )
     drawn_arguments = dict(arguments)
-    sigma_d, growth_d = (drawn_arguments.pop(name) for name in PER_ROW)
-    hook = Hook(
-        sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten()
-    )
     opacities = arguments["opacities"]
     means = arguments["means"]
     attenuated = hook.attenuate(means.reshape(-1, 3), opacities.flatten(), camera)
     drawn_arguments["opacities"] = attenuated.drawn.to(opacities).reshape(opacities.shape)
-    if growth_d is not None:
+    if hook.growth_d is not None:
         name = "scales"
         growth = attenuated.growth
         if arguments.get("covars") is not None:
