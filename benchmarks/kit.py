@@ -37,7 +37,7 @@ def main():
         log_scales=few.log_scales + SHARE * math.log(len(model.gaussians) / COUNT) / 2
     )
     KIT.mkdir(exist_ok=True)
-    for suffix in ("ply", "spz", "glb"):
+    for suffix in ("ply", "spz"):
         clod.save(KIT / f"kit.{suffix}", few)
     cameras = [pictured(few, number, scene.test[k].camera) for number, k in enumerate(VIEWS)]
     about = {"background": [0, 0, 0], "dials": DIALS, "cameras": cameras}

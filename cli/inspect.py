@@ -120,8 +120,8 @@ def _line(name: str, says: str) -> str:
 DESCRIPTION = "Print what a file is, who wrote it, what is in it, and what adapting excludes."
 USAGE = "FILE [--json]"
 EPILOG = """\
-FILE can be a PLY, gsplat's .pt, a .glb or .spz, and, with splat-transform
-installed, a compressed PLY, .sog, .splat or .ksplat.
+FILE can be a PLY, gsplat's .pt, an .spz, and, with splat-transform installed,
+a compressed PLY, .sog, .splat or .ksplat.
 
   looks like   by comments of the file
   needle       a Gaussian more than 10 times as long as its second axis

@@ -3,11 +3,9 @@ splat-transform.
 """
 
 import gzip
-import json
 import os
 import re
 import shutil
-import struct
 import subprocess
 from pathlib import Path
 
@@ -174,19 +172,6 @@ def with_columns(old, **columns):
     for name in rows.dtype.names or ():
         rows[name] = columns[name] if name in columns else old[name]
     return rows
-
-
-def change_glb(path, change):
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    gltf = json.loads(data[20 : 20 + size])
-    change(gltf)
-    text = json.dumps(gltf).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
-    head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
-    path.write_bytes(head + text + rest)
-    return path
 
 
 def needed(degree=0):

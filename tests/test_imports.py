@@ -72,7 +72,7 @@ MODULES = {module_of(path) for path in SOURCES}
 
 
 def unit_of(module):
-    """``io.formats`` of ``io.formats.glb``, ``training`` of ``training.loop``."""
+    """``io.formats`` of ``io.formats.spz``, ``training`` of ``training.loop``."""
     parts = module.split(".")
     return ".".join(parts[: 2 if parts[0] in ("io", "cli") else 1])
 

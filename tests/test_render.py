@@ -254,10 +254,11 @@ def test_calls_are_refused(call, message):
 @pytest.mark.parametrize(
     "name, message",
     [
-        ("x.foo", ".foo is no format to write; choose one of .ply, .glb, "),
+        ("x.foo", ".foo is no format to write; choose one of .ply, .spz, "),
         ("x", "no suffix is no format"),
         ("x.ksplat", ".ksplat is no format"),
         ("x.sog", "is written by clod-adapt export alone: save a .ply"),
+        ("x.glb", "is written by clod-adapt export alone: save a .ply"),
     ],
 )
 def test_files_that_save_does_not_write(name, message, tmp_path):

@@ -14,7 +14,7 @@ from clod_adapter.io.formats.splat_transform import SplatTransform
 
 from ..shared import command as common
 from ..shared.outputs import Outputs, Report
-from .names import FOLDERS, FORMATS, PACKED, PAGE, is_page, level_paths, suffix_of
+from .names import CONVERTED, FOLDERS, FORMATS, PAGE, is_page, level_paths, suffix_of
 
 DIGITS = 6  # significant digits of a level, all of them in its file's name
 
@@ -173,7 +173,7 @@ def check(args: Namespace) -> None:
             f"{out}: {suffix} sorts the Gaussians itself; remove --order",
         ),
     )
-    if folder == "--lod-meta" or suffix in PACKED:
+    if folder == "--lod-meta" or suffix in CONVERTED:
         SplatTransform.find()
 
 
@@ -245,8 +245,8 @@ other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
   sh_degree in cfg_args next to the file.
   .html is the page of "clod-adapt view" in one file, of one model or several;
-  --sv or a budget sets its initial dial value. .sog, .compressed.ply and
-  --lod-meta need splat-transform 3.7 with Node 22, on the PATH or in
+  --sv or a budget sets its initial dial value. .glb, .sog, .compressed.ply
+  and --lod-meta need splat-transform 3.7 with Node 22, on the PATH or in
   CLOD_SPLAT_TRANSFORM.
 
 examples:

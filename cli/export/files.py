@@ -25,7 +25,7 @@ from clod_adapter.cameras import spread
 from clod_adapter.harmonics import with_sh_degree
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
-from clod_adapter.io.file_formats import WRITABLE, write
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.io.settings import Metadata
@@ -38,7 +38,7 @@ from ..shared.command import given_budget, initial_dial
 from ..shared.console import Console, duration
 from ..shared.measure import Stopwatch, choose_dials, solve_dials
 from ..shared.outputs import Report, size
-from .names import FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
+from .names import CONVERTED, FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 
 PLACED = 16  # cameras placed where none are known
 SETTINGS = {
@@ -288,7 +288,7 @@ class Export:
             self._write_page(path, virtual_scale)
             return sum(model.gaussians.whole for model in (self.model, *self.others))
         gaussians, about = self._content(virtual_scale)
-        if suffix not in WRITABLE:
+        if suffix in CONVERTED:
             with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
                 # suffix: the format
                 source, packed = Path(folder) / "plain.ply", Path(folder) / f"packed{suffix}"
@@ -353,9 +353,11 @@ class Export:
                 *words, out, timeout=limit, progress=lambda s: show(f"{text}, {duration(s)} so far")
             )
         self.console.say(f"splat-transform {tool.version} took {duration(seconds)}")
-        self.console.note("splat-transform rounds values and sorts the Gaussians")
         if any(self.model.origin):
             self.console.note("coordinates are relative to the model's origin, which is dropped")
+        if out.suffix == ".glb":  # float32, the rows in their order
+            return
+        self.console.note("splat-transform rounds values and sorts the Gaussians")
         if not tool.gpu and self.gaussians.sh_degree > 0 and out.suffix != ".ply":
             self.console.note(
                 "splat-transform runs without a GPU: its palette of spherical harmonics is coarser"

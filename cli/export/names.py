@@ -5,18 +5,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from clod_adapter import ClodError
-from clod_adapter.io import file_formats
-from clod_adapter.io.file_formats import Format
+from clod_adapter.io.file_formats import WRITABLE, Format
 
 PAGE = ".html"
-# Written by splat-transform, which sorts rows along a space-filling curve.
-PACKED = {
+# Written by splat-transform, which sorts the rows of some along a space-filling curve.
+CONVERTED = {
+    ".glb": Format(about=("float32 (KHR_gaussian_splatting); by splat-transform",)),
     ".sog": Format(about=("8 to 16 bits, SH from a palette; by splat-transform",), ordered=False),
     ".compressed.ply": Format(about=("8 to 11 bits; by splat-transform",), ordered=False),
 }
 FORMATS = {
-    **{suffix: file_formats.FORMATS[suffix] for suffix in file_formats.WRITABLE},
-    **PACKED,
+    **WRITABLE,
+    **CONVERTED,
     PAGE: Format(
         about=("the viewer with the splat, in one file;", "as .spz, or with --exact as float32"),
         ordered=False,

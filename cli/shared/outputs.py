@@ -94,7 +94,7 @@ def write_report(path: Path, report: Report) -> None:
 
 
 # Found at the beginning of the files that clod-adapt writes: in PLY comments, metadata, pages,
-# reports and tables. An .spz is compressed; .sog and .compressed.ply have no such text.
+# reports and tables. An .spz is compressed; what splat-transform writes has no such text.
 OURS = re.compile(rb'clod[-_]adapter|\A\{\s+"(command|checkpoint)": "|\Acheckpoint,max_sv,')
 # The same of the files that adapting writes beside its PLY: adapter, state, report and page.
 BESIDE = re.compile(

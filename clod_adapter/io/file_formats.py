@@ -33,7 +33,7 @@ class Format(NamedTuple):
     """
 
     module: str = ""  # under ``clod_adapter.io``, imported when it is used
-    check: str = "file_formats.check_start"  # rejects, without torch, a file of another format
+    check: str = ""  # rejects, without torch, a file of another format
     carries_sigma: bool = False  # whether the dial is written: sigma_d, growth_d and their settings
     # where it is written, the precision of its values; lines of at most 54 letters
     about: tuple[str, ...] = ()
@@ -42,14 +42,16 @@ class Format(NamedTuple):
 
 PACKED = ".compressed.ply"
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
-_GLB = "float32", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
-_SPZ = ("6 to 24 bits, the dial 16-bit floats",)
 _CONVERTED = Format("formats.splat_transform", "formats.splat_transform.check")
 PLY = Format("ply", "ply.has_dial", carries_sigma=True, about=("exact; baked, in Inria's layout",))
 FORMATS = {
     ".ply": PLY,
-    ".glb": Format("formats.glb", carries_sigma=True, about=_GLB),
-    ".spz": Format("formats.spz", carries_sigma=True, about=_SPZ),
+    ".spz": Format(
+        "formats.spz",
+        "file_formats.check_spz",
+        carries_sigma=True,
+        about=("6 to 24 bits, the dial 16-bit floats",),
+    ),
     ".pt": Format(
         "formats.pt",
         "formats.pt.check",
@@ -61,7 +63,7 @@ FORMATS = {
     ".splat": _CONVERTED,
     ".ksplat": _CONVERTED,
 }
-WRITABLE = tuple(suffix for suffix, form in FORMATS.items() if form.about)
+WRITABLE = {suffix: form for suffix, form in FORMATS.items() if form.about}
 
 
 def format_of(path: Path) -> Format:
@@ -91,7 +93,7 @@ def file_has_dial(path: Path) -> bool:
 
 def check_suffix(path: Path) -> None:
     """Rejects a name whose suffix is none of WRITABLE."""
-    if path.name.lower().endswith((".sog", PACKED)):
+    if path.name.lower().endswith((".glb", ".sog", PACKED)):
         raise ClodError(
             f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it"
         )
@@ -164,15 +166,13 @@ def write(
 START = 64  # bytes that tell the kind of a file
 # first bytes of version 4, which splat-transform reads; earlier versions are gzipped
 NEW_SPZ = b"NGSP"
-_START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", NEW_SPZ)}
 
 
-def check_start(path: Path) -> None:
-    """Rejects a file whose first bytes are not of its suffix's format."""
-    suffix = path.suffix.lower()
+def check_spz(path: Path) -> None:
+    """Rejects a file whose first bytes are not of an SPZ file."""
     start = read_bytes(path, START)
-    if not start.startswith(_START[suffix]):
-        reject(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
+    if not start.startswith((b"\x1f\x8b", NEW_SPZ)):
+        reject(path, start, "is not a .spz file by its first bytes; copy or export it again")
     if start.startswith(NEW_SPZ):
         _reading("formats.splat_transform.check", path)
 
@@ -228,7 +228,7 @@ OTHERS: dict[str | bytes, tuple[str, str]] = {
         "a zip archive",
         "unpack it first; a gsplat checkpoint must be called .pt to be read as one",
     ),
-    b"glTF": ("a glTF model", "call it .glb"),
+    b"glTF": ("a glTF model", "adapt the PLY that it was made from"),
     b"NGSP": ("an SPZ file", "call it .spz"),
     b"ply": ("a PLY file", "call it .ply"),
 }

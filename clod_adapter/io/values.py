@@ -45,7 +45,6 @@ _FEW = 10  # Gaussians; fewer may have any range
 _FAINTEST = -0.1
 _TINY = float(np.finfo(np.float32).tiny)
 _OPAQUE = 1 - 2.0**-24  # the largest float32 below 1
-_SH_C0 = 0.28209479177387814  # gaussians.SH_C0, without torch
 
 
 def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
@@ -165,7 +164,9 @@ def _as_logits(
         arrays["opacity_logits"] = logit(np.clip(opacity, _TINY, _OPAQUE)).astype(np.float32)
         notes.append(f"opacity taken as activated, and stored as logits{clipped}")
     if "scales" in activated_names:
-        arrays["log_scales"] = logs_of(arrays["log_scales"]).astype(np.float32)
+        with np.errstate(invalid="ignore"):  # a NaN that signals
+            scales = np.maximum(arrays["log_scales"].astype(np.float64), _TINY)
+        arrays["log_scales"] = np.log(scales).astype(np.float32)
         notes.append("scales taken as activated, and stored as logarithms")
     if FILTER_3D in arrays:
         arrays["log_scales"], arrays["opacity_logits"] = _fused(arrays, arrays.pop(FILTER_3D))
@@ -270,21 +271,6 @@ def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
     return arrays
 
 
-def half_turn(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The Gaussians under a half turn about z, between axes with y down and with y up.
-
-    Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations
-    ``P R P``, which gives the same ellipsoids, and harmonics of an odd order change sign.
-    """
-    signs = -((-1) ** np.arange(arrays["shN"].shape[1]))  # orders -1, 0, 1, -2, -1, ...
-    return {
-        **arrays,
-        "means": arrays["means"] * np.array([-1, -1, 1], np.float32),
-        "quats": arrays["quats"] * np.array([1, -1, -1, 1], np.float32),
-        "shN": arrays["shN"] * signs.astype(np.float32)[:, None],
-    }
-
-
 def normalized(quats: np.ndarray) -> np.ndarray:
     """``[N, 4]`` float32 quaternions of unit length; none is zero."""
     wide = quats.astype(np.float64)
@@ -300,29 +286,6 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
 def logit(opacities: np.ndarray) -> np.ndarray:
     """The inverse of ``sigmoid``."""
     return special.logit(opacities.astype(np.float64))
-
-
-def scales_of(path: Path, log_scales: np.ndarray) -> np.ndarray:
-    """Standard deviations of their logarithms, float32."""
-    with np.errstate(over="ignore"):
-        scales = np.exp(log_scales)
-    if not np.isfinite(scales).all():
-        raise ClodError(f"{path}: a scale is beyond float32's range; drop such rows first")
-    return scales
-
-
-def logs_of(scales: np.ndarray) -> np.ndarray:
-    """The inverse of ``scales_of``, in float64; values of 0 or less are read as float32's smallest
-    number.
-    """
-    with np.errstate(invalid="ignore"):  # a NaN that signals
-        return np.log(np.maximum(scales.astype(np.float64), _TINY))
-
-
-def colours_of(sh0: np.ndarray, opacities: np.ndarray) -> np.ndarray:
-    """``[N, 4]`` uint8 RGBA of SH degree 0."""
-    colours = 0.5 + _SH_C0 * sh0.reshape(-1, 3).astype(np.float64)
-    return bytes_of(255 * np.concatenate([colours, opacities[:, None]], 1))
 
 
 def bytes_of(values: np.ndarray) -> np.ndarray:

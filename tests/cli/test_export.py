@@ -8,8 +8,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyData
 from torch.testing import assert_close
 
@@ -37,6 +39,7 @@ from runs import data_in
 from scenes import gaussians
 
 EXPORT = "export DIAL --json"
+KHR = "KHR_gaussian_splatting"
 TOOL = """
 import json, os, pathlib, signal, sys, time
 words = sys.argv[1:]
@@ -192,7 +195,7 @@ def test_a_lower_sh_degree_is_fitted(clod, capture):
     assert "has degree 1, and stays as it is" in clod("export x.ply --sh-degree 2 -o y.ply").err
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".glb", ".pt"])
+@pytest.mark.parametrize("suffix", [".ply", ".pt"])
 def test_formats(clod, attenuated, suffix):
     model = load(attenuated)
     done = clod(EXPORT, f"-o x{suffix}")
@@ -310,11 +313,45 @@ def test_failure_of_the_tool_leaves_no_file(
     assert done.err.endswith(said) and files(tmp_path) == [], done
 
 
-def test_the_real_tool(clod, attenuated, tmp_path):
+@pytest.fixture
+def real_tool():
+    """Skips the test if splat-transform is missing."""
     try:
         splat_transform.SplatTransform.find()
     except ClodError as error:
         pytest.skip(str(error))
+
+
+@pytest.mark.usefixtures("real_tool")
+def test_gltf_of_the_real_tool(clod, attenuated):
+    """Has the baked Gaussians, their rows in order, in glTF's axes: y is up and its x goes left."""
+    pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed")
+    done = clod(EXPORT, "--sv 2 -o x.glb")
+    want = baked(attenuated, 2.0)
+    assert done.output["count"] == len(want) and done.report["notes"] == []
+    gltf = pygltflib.GLTF2().load("x.glb")
+    (mesh,), (node,) = gltf.meshes, gltf.nodes
+    (primitive,) = mesh.primitives
+    assert primitive.mode == pygltflib.POINTS and gltf.extensionsUsed == [KHR]
+    assert node.rotation is None and node.translation is None and node.matrix is None
+
+    def column(name):
+        accessor = gltf.accessors[getattr(primitive.attributes, name)]
+        view = gltf.bufferViews[accessor.bufferView]
+        data = gltf.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
+        assert accessor.componentType == pygltflib.FLOAT and accessor.count == len(want)
+        return np.frombuffer(data, "<f4").reshape(len(want), -1)
+
+    assert_array_equal(column("POSITION"), want.means * torch.tensor([-1, -1, 1]))
+    assert_allclose(column(f"{KHR}:SCALE"), want.scales, rtol=1e-6)
+    assert_allclose(column(f"{KHR}:OPACITY")[:, 0], want.opacities, rtol=1e-6)
+    assert_allclose(column(f"{KHR}:SH_DEGREE_0_COEF_0"), want.sh0[:, 0], rtol=1e-6)
+    refused = clod("inspect x.glb", code=2).err
+    assert refused.endswith("x.glb: is a glTF model; adapt the PLY that it was made from\n")
+
+
+@pytest.mark.usefixtures("real_tool")
+def test_a_set_of_the_real_tool(clod, attenuated, tmp_path):
     clod("export DIAL --lod-meta --multiplier 2 -o out")
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     levels = bake_levels(load(attenuated).gaussians, 2.0)

@@ -112,7 +112,8 @@ def test_boxes_are_where_viewers_place_the_gaussians(tmp_path):
     """The node's matrix, then glTF's y-up axes into z-up ones, with a large origin; floaters are
     left out.
     """
-    given = [level.replace(means=level.means * torch.tensor([3.0, 1.0, 0.5])) for level in levels()]
+    size, place = torch.tensor([3.0, 1.0, 0.5]), torch.tensor([20.0, 10.0, 0.0])
+    given = [level.replace(means=level.means * size + place) for level in levels()]
     given[0].means[0] = 1e4
     root = written(tmp_path, given, origin=(1000.0, -2000.0, 50.0))["root"]
     gltf, _ = read_tile(tmp_path / "0_0.glb", tmp_path)

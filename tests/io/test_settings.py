@@ -66,7 +66,7 @@ def read(path):
     return base.gaussians.attenuation, base.gaussians.screen_filter, base.quality_table, notes
 
 
-@pytest.mark.parametrize("kind", ["a.ply", "a.glb", "a.spz", "a.pt", "adapter.safetensors"])
+@pytest.mark.parametrize("kind", ["a.ply", "a.spz", "a.pt", "adapter.safetensors"])
 def test_every_format_uses_the_reader(tmp_path, kind):
     path, ply, adapter = tmp_path / kind, kind == "a.ply", kind == "adapter.safetensors"
 

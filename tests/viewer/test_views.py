@@ -147,7 +147,7 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     second = gaussians.replace(
         sh0=-gaussians.sh0, attenuation=replace(gaussians.attenuation, max_sv=2.0)
     )
-    models = {"a.ply": gaussians, "b.glb": second, "c.ply": scenes.attenuated(9, 1, 5)}
+    models = {"a.ply": gaussians, "b.pt": second, "c.ply": scenes.attenuated(9, 1, 5)}
     for name, model in models.items():
         write(tmp_path / name, model)
     photographed(tmp_path, ring(3, 320, 240))
@@ -167,7 +167,7 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     shown.press("ArrowRight")
     assert shown.page.input_value("#camera") == "free view"
     shown.press("2")
-    shown.until("document.title === 'b.glb'")
+    shown.until("document.title === 'b.pt'")
     assert shown.dial == "s = 2.00"
     shown.run("clod.setWipe(0.4)")
     assert shown.text("#wipe-right") == "base · 400"
@@ -182,7 +182,7 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     shown.until("document.title === 'a.ply'")
     assert shown.text("#compare-with") == "Compare with the base"
     opened = show(*words, state=linked, viewport=TALL)
-    assert opened.page.title() == "b.glb" and not differ(opened.picture(), of_second)
+    assert opened.page.title() == "b.pt" and not differ(opened.picture(), of_second)
 
 
 def test_a_page_of_two_files(show, gaussians, tmp_path):

@@ -1,8 +1,8 @@
 """Finds and runs splat-transform, PlayCanvas's converter of splat files: an optional tool that
 needs Node.
 
-It compresses to SOG and compressed PLY, makes streaming sets, merges Gaussians, and reads what is
-not read here.
+It writes glTF, SOG, compressed PLY and streaming sets, merges Gaussians, and reads what is not read
+here.
 """
 
 from __future__ import annotations

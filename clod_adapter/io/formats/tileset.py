@@ -1,10 +1,6 @@
 """3D Tiles 1.1 (OGC 22-025r4): ``tileset.json`` over ``.glb`` files of several levels, for
 CesiumJS.
 
-CesiumJS 1.145 draws Gaussians only from glTF with ``KHR_gaussian_splatting_compression_spz_2``,
-named in the index: a buffer with the bytes of an SPZ file, attributes without data, and a node with
-a ``matrix``.
-
 The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST
 Gaussians of the finest level, each a chain of tiles from the next finer level to the finest; a tile
 replaces its parent (refine REPLACE). A tile with ``geometricError`` g is shown from the distance
@@ -29,13 +25,10 @@ import torch
 from clod_adapter._support.arrays import float64_array
 from clod_adapter._support.text import package_version
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.formats import spz
-from clod_adapter.io.formats.glb import EXTENSION, harmonics, write_points
-from clod_adapter.io.settings import Metadata
+from clod_adapter.io.formats.tile import EXTENSION, SPZ, write_tile
 from clod_adapter.origin import Origin
 
 TILESET = "tileset.json"
-SPZ = "KHR_gaussian_splatting_compression_spz_2"
 ALLOWED = 16.0  # pixels of screen-space error that viewers allow by default
 FOCAL = 935.0  # pixels, of a view 60 degrees and 1,080 pixels high
 LARGEST = 1 << 18  # Gaussians of the finest level in a cell, unless they share one centre
@@ -90,29 +83,6 @@ def write_tileset(
     }
     (folder / TILESET).write_text(json.dumps(index, indent=1), encoding="utf-8")
     return tuple(dict.fromkeys(notes))
-
-
-def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, ...]:
-    """Writes a ``.glb`` whose only buffer is an SPZ file; what that rounds."""
-    packed = path.with_suffix(".spz")
-    notes = spz.write(packed, gaussians, Metadata(screen_filter=gaussians.screen_filter))
-    data = packed.read_bytes()
-    packed.unlink()
-    shapes = {
-        "POSITION": "VEC3",
-        "COLOR_0": "VEC4",
-        f"{EXTENSION}:SCALE": "VEC3",
-        f"{EXTENSION}:ROTATION": "VEC4",
-    }
-    shapes |= dict.fromkeys(harmonics(gaussians.sh_degree)[1:], "VEC3")
-    accessors: dict[str, Any] = {
-        name: {"count": len(gaussians), "type": shape} for name, shape in shapes.items()
-    }
-    x, y, z = origin
-    node = {"matrix": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, -x, -y, z, 1]}  # a half turn about z
-    views = [{"buffer": 0, "byteLength": len(data)}]
-    write_points(path, gaussians.means, accessors, node, views, [data], {SPZ: {"bufferView": 0}})
-    return notes
 
 
 def _cells(centres: Sequence[np.ndarray], rows: Rows) -> Iterator[Rows]:
