@@ -68,8 +68,7 @@ def check(args: Namespace) -> None:
     common.check_inputs(args.images, *paths(args))
     if args.base and file_has_dial(Path(args.base)):
         raise ClodError(
-            f"{args.base}: has a dial; give --base the checkpoint that was adapted, or use"
-            " --against"
+            f"{args.base}: has a dial; give --base the checkpoint before it, or use --against"
         )
 
 

@@ -155,8 +155,7 @@ def describe(run: Run, result: Result) -> Report:
     }
     if run.cut:
         run.console.note(
-            "the measurements were interrupted: only the dial values that were finished are"
-            " reported"
+            "the measurements were interrupted: only finished dial values are reported"
         )
     report = {
         "command": "adapt",

@@ -14,7 +14,7 @@ from clod_adapter.io.formats.splat_transform import SplatTransform
 
 from ..shared import command as common
 from ..shared.outputs import Outputs, Report
-from .names import CONVERTED, FOLDERS, FORMATS, PAGE, is_page, level_paths, suffix_of
+from .names import AGREE, CONVERTED, FOLDERS, FORMATS, PAGE, is_page, level_paths, suffix_of
 
 DIGITS = 6  # significant digits of a level, all of them in its file's name
 
@@ -62,8 +62,11 @@ def add_arguments(parser: ArgumentParser) -> None:
         f" {MULTIPLIER:g})"
     )
     output.add_argument("--multiplier", metavar="M", type=float, default=MULTIPLIER, help=text)
-    text = "fit the view-dependent colours to this SH degree, 0 to 3: most of a file's bytes"
-    output.add_argument("--sh-degree", metavar="N", type=int, choices=range(4), help=text)
+    text = (
+        "fit view-dependent colours, most of a file's bytes, to this SH degree, 0 to 3; auto: the"
+        f" lowest whose renders have {AGREE:g} dB against the file's"
+    )
+    output.add_argument("--sh-degree", metavar="N", choices=["0", "1", "2", "3", "auto"], help=text)
     text = "fine-tune what is baked for a dial value on the photographs of --images"
     output.add_argument("--tune", action="store_true", help=text)
     output.add_argument(
@@ -91,10 +94,7 @@ def check(args: Namespace) -> None:
         ),
         (
             folder and bakes,
-            (
-                f"{folder} has a level for each band of distance, no dial value; remove --levels,"
-                " --sv or the budget"
-            ),
+            f"{folder} has levels by distance, no dial value; remove --levels, --sv or the budget",
         ),
         (
             args.multiplier != MULTIPLIER and not folder,
@@ -115,10 +115,7 @@ def check(args: Namespace) -> None:
         ),
         (
             args.tune and (page or not bakes or args.images is None or args.camera is not None),
-            (
-                "--tune is for dial values that are baked for all cameras: give --images and a dial"
-                " value or budget, without --camera"
-            ),
+            "--tune is for what is baked for all cameras: give --images, --sv 2, and no --camera",
         ),
         (
             args.exact and not page,
@@ -127,10 +124,7 @@ def check(args: Namespace) -> None:
         (
             args.images is not None
             and not (bakes or args.order or page or args.sh_degree is not None),
-            (
-                f"--images is used for baking, --sh-degree, --order and {PAGE} only; add one of"
-                " them, as in --sv 2"
-            ),
+            f"--images is for baking, --sh-degree, --order and {PAGE} only; add one, as in --sv 2",
         ),
         (
             folder and out.suffix.lower() in (".json", *FORMATS),
@@ -150,23 +144,12 @@ def check(args: Namespace) -> None:
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
     refuse(
         (
-            bakes and not dial,
-            f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one",
-        ),
-        (
-            folder and not dial,
-            f"{args.model}: has no sigma_d, so there are no levels; adapt it first",
-        ),
-        (
-            args.order and not dial,
-            f"{args.model}: has no sigma_d to order its Gaussians by; adapt it first",
+            (bakes or folder or args.order) and not dial,
+            f"{args.model}: has no sigma_d, so no dial values, levels or order; adapt it first",
         ),
         (
             dial and not bakes and form and not form.carries_sigma,
-            (
-                f"{out}: {suffix} cannot store a dial; choose a dial value to bake, as in --sv 1,"
-                f" or another format ({others})"
-            ),
+            f"{out}: {suffix} cannot store a dial; bake one, as in --sv 1, or choose of {others}",
         ),
         (
             args.order and form and not form.ordered,
@@ -239,7 +222,8 @@ tuning:
 SH degree:
   --sh-degree 1 saves 144 of 248 bytes for each Gaussian of degree 3 in a .ply.
   The degrees that remain are fitted to the colours that the cameras see, by
-  least squares; a note has the PSNR against the file as it was.
+  least squares; a note has the PSNR against the file as it was. auto takes the
+  lowest degree that the eye does not tell from it.
 
 other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from

@@ -38,7 +38,7 @@ from ..shared.command import given_budget, initial_dial
 from ..shared.console import Console, duration
 from ..shared.measure import Stopwatch, choose_dials, solve_dials
 from ..shared.outputs import Report, size
-from .names import CONVERTED, FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
+from .names import AGREE, CONVERTED, FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 
 PLACED = 16  # cameras placed where none are known
 SETTINGS = {
@@ -72,10 +72,7 @@ def export(args: Namespace) -> Report:
         baked = (
             f"exact at the camera of {camera.name} only" if camera else f"baked for {export.about}"
         )
-        scales = "" if export.gaussians.growth_d is None else "; the scales include growth"
-        print(
-            f"{baked}; lossy: without the dial and the Gaussians culled at this dial value{scales}"
-        )
+        print(f"{baked}; lossy: without the dial and the Gaussians culled at this dial value")
     return {
         "model": args.model,
         "files": [args.model, *args.others],
@@ -186,23 +183,26 @@ class Export:
         )
         return cameras, f"{len(cameras)} placed cameras"
 
-    def _reduce_sh_degree(self, sh_degree: int) -> None:
+    def _reduce_sh_degree(self, wanted: str) -> None:
         """Replaces the model's Gaussians, with a note on what that changes."""
-        before, cameras = self.model.gaussians, self.cameras
-        after = with_sh_degree(before, sh_degree, cameras)
-        if after is before:
-            self.console.note(
-                f"--sh-degree {sh_degree}: the file has degree {before.sh_degree}, and stays as"
-                " it is"
-            )
-            return
+        before = self.model.gaussians
         inputs.prepare_kernels(self.console, before.means.device, training=False)
+        for degree in range(before.sh_degree):
+            if wanted not in ("auto", str(degree)):
+                continue
+            after = with_sh_degree(before, degree, self.cameras)
+            agreement = self._agreement(after, before)
+            if wanted == "auto" and agreement < AGREE:
+                continue
+            self.console.note(
+                f"SH degree {degree}: renders have a PSNR of {agreement:.1f} dB against those with"
+                f" degree {before.sh_degree} (fitted to {self.about})"
+            )
+            self.model = replace(self.model, gaussians=after, vertex=None)
+            return
         self.console.note(
-            f"--sh-degree {sh_degree}: renders have a PSNR of"
-            f" {self._agreement(after, before):.1f} dB against those with degree"
-            f" {before.sh_degree} (fitted to {self.about})"
+            f"--sh-degree {wanted}: the file has SH degree {before.sh_degree}, and stays as it is"
         )
-        self.model = replace(self.model, gaussians=after, vertex=None)
 
     def _agreement(self, shown: Gaussians, exact: Gaussians) -> float:
         """PSNR in dB of renders of the first against those of the second, in the mean over COMPARED

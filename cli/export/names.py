@@ -25,6 +25,7 @@ FORMATS = {
 }
 # formats in which every reader finds the screen-space filter
 STORE_FILTER = (".spz", PAGE)
+AGREE = 45.0  # dB between the renders of two SH degrees that look alike
 # options that make OUT a folder, and its index
 FOLDERS = {"--lod-meta": "lod-meta.json", "--3dtiles": "tileset.json"}
 

@@ -115,7 +115,7 @@ ERRORS = [
     ("eval base.ply --images scene --against base.ply base.ply", "base.ply: is given twice"),
     (
         "eval base.ply --images scene --base dial.ply",
-        "has a dial; give --base the checkpoint.* --against$",
+        "has a dial; give --base the checkpoint before it, or use --against$",
     ),
     ("eval base.ply --images scene --sv=-0.5 --json", "--sv has -0.5, it must be at least 0"),
     (
@@ -150,7 +150,7 @@ ERRORS = [
     ("export bare.ply -o x", "x: --out must end in one of .ply, .*, which is the format"),
     (
         "export bare.ply -o x.sog",
-        "x.sog: .sog cannot store a dial; choose a dial value .* format .*.ply",
+        "x.sog: .sog cannot store a dial; bake one, .* choose of .*.ply",
     ),
     (
         "export bare.ply -o x.sog --sv 2 --order extinction",
@@ -167,11 +167,11 @@ ERRORS = [
     ),
     (
         "export base.ply -o x --lod-meta",
-        "base.ply: has no sigma_d, so there are no levels; adapt it first",
+        "base.ply: has no sigma_d, so no dial values, levels or order; adapt it first",
     ),
     (
         "export bare.ply -o x --lod-meta --levels 1,2",
-        "--lod-meta has a level for each band of distance, no dial value",
+        "--lod-meta has levels by distance, no dial value",
     ),
     (
         "export bare.ply -o x.ply --multiplier 2",
@@ -184,11 +184,11 @@ ERRORS = [
     ("export bare.ply -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
     (
         "export bare.ply -o x.ply --images scene",
-        "--images is used for baking, --sh-degree, --order and .html",
+        "--images is for baking, --sh-degree, --order and .html",
     ),
     (
         "export bare.ply -o x.ply --sv 2 --tune",
-        "--tune is for dial values that are baked for all cameras",
+        "--tune is for what is baked for all cameras",
     ),
     ("apply bare.ply dial.safetensors -o x.ply", "bare.ply: a different base was given"),
     ("apply base.ply dial.safetensors -o pipe.ply", "pipe.ply: is no regular file"),
