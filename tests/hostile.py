@@ -1,12 +1,13 @@
 """Runs the command in hostile surroundings, each as a shell line with the exit code that is right.
 
-    python benchmarks/hostile.py                # several minutes
-    python benchmarks/hostile.py --only --batch  # the lines with this text
+    PYTHONPATH=benchmarks python tests/hostile.py    # several minutes
+    PYTHONPATH=benchmarks python tests/hostile.py --only --batch    # the lines with this text
 
 A failure is another exit code, a traceback or a warning, an error that is not one last line, an
 input that changed, or other new files than expected.
 """
 
+import argparse
 import os
 import re
 import shutil
@@ -19,7 +20,6 @@ from functools import partial
 from pathlib import Path
 
 from city import write_city
-from common import arguments
 
 SCENE = "base.ply --images scene --iters 2 --max-sv 2 --accept-loss -o new.ply"
 EVAL = "eval base.ply --images scene --sv 1 --quiet"
@@ -223,7 +223,7 @@ def contents(folder):
 
 
 def main():
-    parser = arguments(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="only the lines with this text")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(os.cpu_count()) as pool:
