@@ -6,24 +6,28 @@ budgets.
     python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record    # its author's, too
 
 SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
-again and again by splat-transform (``make peers``) in both its ways, and the author's own.
-``export --lod-meta`` of the adapted file is drawn too. A set is drawn by the rule of PlayCanvas
-2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is that of the
-nearest point of its box; level b >= 1 begins at K multiplier^(b - 1); in each frame one K for all
-nodes is such that their counts, in view or not, meet the budget. A set has the multiplier of
-MULTIPLIERS that is best for it. The dial has the value that keeps as many Gaussians in that frame.
-PSNR is that of the mean squared error over VIEWS placed cameras, against renders of SCENE, or over
-held-out photographs.
+again and again by splat-transform (``make peers``) in both its ways, and the author's own. The
+levels of ``export --lod-meta`` are drawn too. No set is packed. A set is drawn by the rule of
+PlayCanvas 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is that of
+the nearest point of its box, times up to BEHIND where that is behind the camera; level b >= 1
+begins at K multiplier^(b - 1); in each frame one K for all nodes is such that their counts, in view
+or not, meet the budget. A set has the multiplier of MULTIPLIERS that is best for it. The dial has
+the value that keeps as many Gaussians in that frame, in view or not, by distances with the same
+factor; "all alike" is without the factor. Plain files are drawn as they are: each halved one, and
+``export --keep`` of its count. PSNR is that of the mean squared error over VIEWS placed cameras,
+against renders of SCENE, or over held-out photographs.
 """
 
 import json
 import math
 import tempfile
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import clod_adapter as clod
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.losses import decibels, mean_squared_error
 from common import Table, append, arguments, clod_adapt, last, percent, with_best
 from tuning import TIMEOUT, find_tool
@@ -34,6 +38,7 @@ import torch
 FILE, VIEWS, SEED = "stream.jsonl", 16, 77
 BUDGETS, MULTIPLIERS = (0.4, 0.18, 0.08, 0.04), (1.6, 2.0, 3.0)
 LEAF, HALVED = 8192, 6  # Gaussians of a node; times that SCENE is halved
+BEHIND = 1.5  # factor of the distance of what is straight behind the camera: lodBehindPenalty
 SETS = {"halved": "--decimate", "halved adaptively": "--decimate-adaptive"}
 SCENES = {  # of the tables
     "taebak4": "an aerial scene of 212,464",
@@ -50,7 +55,6 @@ SHOWN = {
     "halved adaptively": "halved adaptively",
     "author": "its author's levels",
 }
-Files = dict[float, list[Path]]
 
 
 def main():
@@ -72,41 +76,58 @@ def main():
         append(FILE, {"scene": scene, **row}, args.record)
         for row in of_dial(base, out, views):
             append(FILE, {"scene": scene, **row}, args.record)
-        for row in of_sets(base, sets_of(args.scene, args.author, out, folder), views):
+        adapted = clod.load(out)
+        sets = sets_of(args.scene, args.author, adapted.gaussians, folder)
+        for row in (*of_plain(adapted, sets, views, len(base)), *of_sets(base, sets, views)):
             append(FILE, {"scene": scene, **row}, args.record)
 
 
 def of_dial(base, adapted, views):
     """The dial at 1, 2 and 5, and at each budget."""
-    dial = clod.load(adapted).gaussians
+    model = clod.load(adapted).gaussians
     for s in (0.0, 1.0, 2.0, 5.0):
-        (row,) = clod.evaluate(clod.detach(dial) if s == 0 else dial, views, [max(s, 1.0)])
+        (row,) = clod.evaluate(clod.detach(model) if s == 0 else model, views, [max(s, 1.0)])
         share = row.kept / len(base)
         yield {"method": "dial", "level": f"s = {s:g}", "share": share, "psnr": row.psnr}
-    for budget in BUDGETS:
-        yield {"method": "dial", **measured(Dial(dial), views, budget, len(base))}
+    for name, behind in (("dial", BEHIND), ("dial, all alike", 1.0)):
+        for budget in BUDGETS:
+            yield {"method": name, **measured(Dial(model, behind), views, budget, len(base))}
 
 
 def sets_of(scene, author, adapted, folder):
     """The levels of each set for each multiplier, the finest first."""
-    sets = {}
-    for name, option in SETS.items():
-        sets[name] = dict.fromkeys(MULTIPLIERS, [scene, *halved(scene, option, folder / name)])
+    rivals = {name: halved(scene, option, folder / name) for name, option in SETS.items()}
     if author:
-        sets["author"] = dict.fromkeys(MULTIPLIERS, [scene, *author])
-    sets["lod-meta"] = {
-        each: own_levels(adapted, each, folder / f"own{each:g}") for each in MULTIPLIERS
-    }
+        rivals["author"] = author
+    sets = {}
+    for name, coarser in rivals.items():
+        levels = [clod.load(file).gaussians for file in (scene, *coarser)]
+        sets[name] = dict.fromkeys(MULTIPLIERS, levels)
+    sets["lod-meta"] = {each: own_levels(adapted, each) for each in MULTIPLIERS}
     return sets
+
+
+def of_plain(adapted, sets, views, whole):
+    """Plain files of the same counts, drawn everywhere: ``export --keep``, and the merged ones."""
+    places = adapted.viewpoints
+    for name in SETS:
+        for merged in sets[name][MULTIPLIERS[0]][1:]:
+            share = len(merged) / whole
+            yield {"method": f"{name}, plain", **measured(Plain(merged), views, share, whole)}
+    for merged in sets["halved"][MULTIPLIERS[0]][1:]:
+        share = len(merged) / whole
+        dial = clod.dial_for(adapted.gaussians, keep=len(merged), cameras=places, baked=True)
+        baked = clod.bake(adapted.gaussians, dial.virtual_scale, cameras=places)
+        yield {"method": "plain", **measured(Plain(baked), views, share, whole)}
 
 
 def of_sets(base, sets, views):
     """Each set at each budget, with the multiplier that is best there."""
     frames = Frames(base)
-    for name, files in sets.items():
+    for name, by_multiplier in sets.items():
         found = {}
-        for multiplier, levels in files.items():
-            drawn = Levels([clod.load(file).gaussians for file in levels], multiplier, frames)
+        for multiplier, levels in by_multiplier.items():
+            drawn = Levels(levels, multiplier, frames)
             for budget in BUDGETS:
                 row = {"method": name, **measured(drawn, views, budget, len(base))}
                 row["multiplier"] = multiplier
@@ -138,15 +159,31 @@ def measured(shown, views, budget, whole):
 @dataclass
 class Dial:
     gaussians: clod.Gaussians
+    behind: float = BEHIND  # 1 where all directions count alike
 
     def frame(self, camera, count):
         """What is drawn of about ``count`` Gaussians, the dial value, and their exact number."""
-        s = clod.dial_for(self.gaussians, keep=count, cameras=[camera]).virtual_scale
-        return (
-            self.gaussians,
-            s,
-            int(clod.render(self.gaussians, camera, virtual_scale=s).kept.sum()),
-        )
+        away = (self.gaussians.means - camera.position).double().numpy()
+        distances = torch.from_numpy(penalized(away, camera, self.behind))
+        distances /= self.gaussians.attenuation.scene_distance
+
+        def kept(s):
+            return int(dial(self.gaussians, distances, s).keep.sum())
+
+        low, high = 1e-3, 1e3
+        for _ in range(40):
+            s = math.sqrt(low * high)
+            low, high = (s, high) if kept(s) > count else (low, s)
+        return self.gaussians, high, kept(high)
+
+
+@dataclass
+class Plain:
+    gaussians: clod.Gaussians
+
+    def frame(self, camera, count):
+        """As ``Dial.frame``."""
+        return self.gaussians, 1.0, len(self.gaussians)
 
 
 class Cut(NamedTuple):
@@ -194,7 +231,14 @@ class Frames:
 
     def distances(self, camera):
         eye = camera.position.double().numpy()
-        return np.linalg.norm(np.clip(eye, self.low, self.high) - eye, axis=1)
+        return penalized(np.clip(eye, self.low, self.high) - eye, camera, BEHIND)
+
+
+def penalized(away, camera, factor):
+    """Distances, of what is straight behind the camera times the factor."""
+    distances = np.linalg.norm(away, axis=1)
+    cosines = away @ camera.viewmat[2, :3].double().numpy() / np.maximum(distances, 1e-9)
+    return distances * (1 + (factor - 1) * np.maximum(-cosines, 0))
 
 
 class Levels:
@@ -238,14 +282,8 @@ def halved(scene, option, folder):
     return files[1:]
 
 
-def own_levels(adapted, multiplier, folder):
-    """The levels of ``export --lod-meta``, as splat-transform reads them."""
-    clod_adapt("export", adapted, "--lod-meta", "--multiplier", multiplier, "--out", folder)
-    meta, files = folder / "lod-meta.json", []
-    for level in range(int(json.loads(meta.read_text("utf-8"))["lodLevels"])):
-        files.append(folder / f"level{level}.ply")
-        find_tool().run("-q", meta, "-L", str(level), files[-1], timeout=TIMEOUT)
-    return files
+def own_levels(adapted, multiplier):
+    return [level.gaussians for level in clod.bake_levels(adapted, multiplier)]
 
 
 def page_table(scene):
@@ -264,6 +302,20 @@ def page_table(scene):
             ]
     heads = [f"{SCENES[scene]} (`{scene}`), budget", *percent(BUDGETS)]
     return Table(heads, with_best(lines, ".1f"), rows)
+
+
+def plain_table():
+    """Plain files of all scenes."""
+    found = last(FILE, "scene", "method", "level")
+    shares = [f"{1 / 2**k:.0%}" for k in range(1, HALVED + 1)]
+    ways = {"plain": "exported", **{f"{name}, plain": name for name in SETS}}
+    rows, lines = [], []
+    for scene, (method, label) in product(SCENES, ways.items()):
+        line = [found.get((scene, method, share)) for share in shares]
+        if any(line):
+            rows += line
+            lines.append([f"{scene}, {label}", *(f"{row['psnr']:.1f}" for row in line)])
+    return Table(["", *shares], lines, rows)
 
 
 if __name__ == "__main__":

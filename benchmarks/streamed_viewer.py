@@ -2,16 +2,18 @@
 
     python benchmarks/streamed_viewer.py SCENE.ply --record
 
-SCENE is adapted in 100 steps without photographs and exported with
-``--lod-meta``. A placed camera, and the same moved back by 2 and 8 times the median distance of the
-centres, see the set at each budget: in PlayCanvas with the settings that the export prints, and by
-the rule with the file's own nodes. PSNR is against renders of SCENE, at budget 1 that of the finest
-level. Renders have the screen-space filter of PlayCanvas, VARIANCE: it adds its 0.3 to covariances
-of half pixels. ``min_pixels`` is its ``minPixelSize``, by default 2, which leaves out Gaussians of
-less than 0.125 px^2.
+SCENE is adapted in 100 steps without photographs and exported with ``--lod-meta``. A placed camera,
+and the same moved back by 2 and 8 times the median distance of the centres, see the set at each
+budget: in PlayCanvas with the settings that the export prints, and by the rule with the file's own
+nodes and the count that PlayCanvas draws. PSNR is what levels cost: against the finest level
+everywhere, each drawn by its own program, as their filters differ. At budget 1 it is that level's
+against renders of SCENE. Renders have the filter of PlayCanvas, VARIANCE: it adds its 0.3 to
+covariances of half pixels. ``min_pixels`` is its ``minPixelSize``, by default 2, which leaves out
+Gaussians of less than 0.125 px^2.
 """
 
 import io
+import json
 import sys
 import tempfile
 import threading
@@ -19,13 +21,15 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from itertools import product
 from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter.config import ScreenFilter
 from clod_adapter.losses import psnr
 from common import ROOT, append, arguments, clod_adapt
-from stream import SEED, VIEWS, Frames, Levels, own_levels
+from stream import SEED, VIEWS, Frames, Levels
+from tuning import TIMEOUT, find_tool
 
 import numpy as np
 import torch
@@ -108,11 +112,21 @@ def main():
         folder = Path(temporary)
         model = folder / "adapted.ply"
         clod_adapt(args.scene, "--iters", 100, "--accept-loss", "--out", model)
-        files = own_levels(model, MULTIPLIER, folder / "set")
+        files = stored_levels(model, folder / "set")
         begins = clod.bake_levels(clod.load(model).gaussians, MULTIPLIER)[1].begins
         with shown(folder) as page:
             for row in compare(page, loaded(args.scene), files, begins):
                 append(FILE, {"scene": args.scene.stem, **row}, args.record)
+
+
+def stored_levels(model, folder):
+    """The levels of ``export --lod-meta``, as splat-transform reads them."""
+    clod_adapt("export", model, "--lod-meta", "--multiplier", MULTIPLIER, "--out", folder)
+    meta, files = folder / "lod-meta.json", []
+    for level in range(int(json.loads(meta.read_text("utf-8"))["lodLevels"])):
+        files.append(folder / f"level{level}.ply")
+        find_tool().run("-q", meta, "-L", str(level), files[-1], timeout=TIMEOUT)
+    return files
 
 
 def loaded(file):
@@ -130,16 +144,22 @@ def compare(page, base, files, begins):
         viewmat[2, 3] += times * distance
         moved = replace(camera, viewmat=viewmat)
         wanted = clod.render(base, moved).pixels
-        for budget in BUDGETS:
+        finest = {}
+        for budget, pixels in product(BUDGETS, MIN_PIXELS):
             count = round(budget * len(base))
-            gaussians, _, drawn = levels.frame(moved, count)
-            row = {"moved": times, "budget": budget, "count": drawn}
-            row["psnr"] = psnr(clod.render(gaussians, moved).image, wanted)
             given = [viewmat.T.ravel().tolist(), camera.K[1, 1].item(), begins, MULTIPLIER, count]
-            for pixels in MIN_PIXELS:
-                picture = streamed(page, [*given, pixels])
-                row["psnr_viewer"] = psnr(picture, wanted)
-                yield row | page.evaluate("drawn()")
+            picture = streamed(page, [*given, pixels])
+            row = {"moved": times, "budget": budget} | page.evaluate("drawn()")
+            gaussians, _, row["count"] = levels.frame(moved, row["count_viewer"])
+            rendering = clod.render(gaussians, moved)
+            if budget == 1.0:
+                finest[pixels] = rendering.pixels, picture
+                by_rule = by_viewer = wanted
+            else:
+                by_rule, by_viewer = finest[pixels]
+            row["psnr"] = psnr(rendering.image, by_rule)
+            row["psnr_viewer"] = psnr(picture / 255, by_viewer)
+            yield row
 
 
 def streamed(page, given):
@@ -150,7 +170,7 @@ def streamed(page, given):
     while picture != before:
         page.wait_for_timeout(500)
         before, picture = picture, page.screenshot()
-    return torch.from_numpy(read_picture(io.BytesIO(picture)) / 255)
+    return torch.from_numpy(read_picture(io.BytesIO(picture))).to(torch.uint8)
 
 
 class Leaves:
