@@ -27,9 +27,8 @@ from common import (
     append,
     arguments,
     by_scene,
-    checkpoint,
     last,
-    photographs,
+    opened,
     psnr_at,
     psnr_kept,
 )
@@ -69,6 +68,15 @@ SHOWN = {  # in the table
     ("lr_means", 0.03): "half the rate of means",
     ("lr_means", 0.12): "twice",
 }
+SHOWN_PLACED = {  # without photographs
+    ("default", None): "default",
+    ("PLACED_SHARE", 0.8): "0.8 times as many far ones, not 0.4",
+    ("PLACED_NEARER", 0.2): "from the 20th percentile of the distances on, not the 60th",
+    ("PLACED_NEARER", 0.5): "from the median on",
+    ("PLACED_CONTRAST", 1.0): "importance itself, not its cube",
+    ("exponent", 1.5): "counts `s^-1.5`, not `s^-1.75`",
+    ("exponent", 2.0): "counts `s^-2`",
+}
 
 
 def main():
@@ -77,20 +85,18 @@ def main():
     parser.add_argument("--names", nargs="+", choices=ALTERNATIVES, default=list(ALTERNATIVES))
     args = parser.parse_args()
     for scene in args.scenes:
-        base, views = opened(scene)
+        base, views = inputs(scene)
         measure(scene, base, views, "default", None)
         for name in args.names:
             for value in ALTERNATIVES[name]:
                 measure(scene, base, views, name, value)
 
 
-def opened(scene):
+def inputs(scene):
     """The checkpoint and the views to train and to measure on."""
-    demo = Path(scene) / "base.ply"
-    if demo.exists():
-        return clod.load(demo).gaussians, clod.load_scene(demo.with_name("capture"))
     if not scene.endswith(".ply"):
-        return checkpoint(scene).gaussians, photographs(scene)
+        base, views = opened(scene)
+        return base.gaussians, views
     base = clod.load(scene).gaussians
     return base, clod.Scene(with_pseudo_views(base, None).train, tuple(rendered(base)))
 
@@ -115,10 +121,18 @@ def measure(scene, base, views, name, value):
 
 def page_table():
     """The choices of SHOWN on three captures."""
-    scenes, shares = ("plush_half", "demo", "ci_banana"), (0.35, 0.12)
+    return table(SHOWN, ("plush_half", "demo", "ci_banana"), (0.35, 0.12))
+
+
+def placed_table():
+    """Those of SHOWN_PLACED on large scenes."""
+    return table(SHOWN_PLACED, ("taebak4", "showroom3"), (0.35, 0.12, 0.05))
+
+
+def table(choices, scenes, shares):
     found = last(FILE, "scene", "choice", "value")
     rows, lines = [], []
-    for choice, label in SHOWN.items():
+    for choice, label in choices.items():
         line = [label]
         for scene in scenes:
             row = found.get((scene, *choice))

@@ -56,6 +56,14 @@ def photographs(scene):
     return clod.load_scene(capture(scene.partition("/")[0]))
 
 
+def opened(scene):
+    """The checkpoint and the photographs of a scene of the shared data, or of a demo's folder."""
+    demo = Path(scene) / "base.ply"
+    if demo.exists():
+        return clod.load(demo), clod.load_scene(demo.with_name("capture"))
+    return checkpoint(scene), photographs(scene)
+
+
 def quality(gaussians, views, dials):
     """``clod.evaluate`` at one or more dial values, as rows of results."""
     return [row.as_dict() for row in clod.evaluate(gaussians, views, dials)]

@@ -1,22 +1,18 @@
-"""Quality after adapting a base that was trained to its end, with few photographs, on held-out
-photographs.
+"""Adapting checkpoints that were trained to their end, on held-out photographs.
 
-    # folders with images/, sparse/0/ and base.ply
-    python benchmarks/converged.py FOLDER [FOLDER ...] --record
-    python benchmarks/converged.py plush_half bonsai146 --every 3 --record
-    python benchmarks/converged.py plush_half bonsai146 --every 3 --base pretrained.ply --record
+    python benchmarks/converged.py plush_half bonsai146 ci_banana --record
 
-Runs the default command on ``base.ply``. With ``--every`` the folders are captures of the shared
-data, of which that part of the photographs, by name, is copied to a folder in ``benchmarks/cache``;
-those held out there are held out from the capture too. The base is trained there from the COLMAP
-points (``from_points.py``), or, with ``--base``, is that checkpoint, trained on all photographs,
-and tuned further on those that are left.
+The bases are trained on the training photographs of captures of the shared data, from their COLMAP
+points, and kept in ``benchmarks/cache``. This is plain splatting with a fixed number of Gaussians:
+rounds of tuning, after each of which transparent Gaussians are moved to opaque ones, as in 3DGS as
+Markov Chain Monte Carlo (arXiv 2404.09591). Then the default command adapts them.
 """
 
 import tempfile
 from pathlib import Path
 
 import clod_adapter as clod
+from clod_adapter.gaussians import SH_C0
 from common import (
     CACHE,
     Table,
@@ -25,89 +21,117 @@ from common import (
     capture,
     clod_adapt,
     last,
+    photographs,
     psnr_kept,
     quality,
     report_of,
 )
-from from_points import thin, write_base
 from tuning import Tuning, tune
 
-FILE = "converged.jsonl"
-DIALS = (1.0, 2.0, 5.0)
-ITERS, FINAL = 1500, 0.01  # of tuning a checkpoint further
-SHOWN = {  # in the table
-    "plush_half-3-points": "plush_half",
-    "bonsai146-3-points": "bonsai146",
-    "room": "a room",
-    "pot": "a potted plant",
-}
+import numpy as np
+import pycolmap
+import torch
+from scipy.spatial import cKDTree
+
+FILE, DIALS = "converged.jsonl", (1.0, 2.0, 5.0)
+COUNT, COUNT_EACH = 60_000, 1500  # Gaussians at most; for each photograph
+ROUNDS = 8  # that end with a relocation
+ROUND = 500  # steps of each
+LAST = 3000  # steps after them
+TRANSPARENT = 0.05  # opacity below which a Gaussian is moved
+OPACITY = 0.3
+SH_COEFFICIENTS = 15
 
 
 def main():
     parser = arguments(__doc__, record=FILE)
-    parser.add_argument("folders", nargs="+", metavar="FOLDER")
-    parser.add_argument(
-        "--every", type=int, metavar="K", help="captures, of which one photograph in K is used"
-    )
-    parser.add_argument(
-        "--base", metavar="CHECKPOINT", help="with --every: make base.ply from this file"
-    )
+    parser.add_argument("scenes", nargs="+", help="folders of the shared data")
     args = parser.parse_args()
-    for name in args.folders:
-        folder = make(capture(name), args.every, args.base) if args.every else Path(name).resolve()
-        run(folder, record=args.record)
+    for name in args.scenes:
+        views = photographs(name)
+        base = trained(name, views.train)
+        with tempfile.TemporaryDirectory() as place:
+            out = Path(place) / "dial.ply"
+            words = ("--images", capture(name), "--out", out, "--accept-loss", "--quiet")
+            process = clod_adapt(base, *words)
+            row = {
+                "name": name,
+                "photographs": len(views.train),
+                "gaussians": len(clod.load(base).gaussians),
+                "base": report_of(out)["base_rows"][0],
+                "rows": quality(clod.load(out).gaussians, views.test, DIALS),
+                "seconds": round(process.seconds, 1),
+            }
+        append(FILE, row, args.record)
 
 
-def make(source, every, start):
-    """The folder of the thinned capture with its base, made now if it is not in the cache."""
-    folder = CACHE / f"{source.name}-{every}-{Path(start or 'points').stem}"
-    base = folder / "base.ply"
-    if base.exists():
-        return folder
-    thin(source, folder, every)
-    if start is None:
-        write_base(folder)
-    else:
-        pretrained = clod.load(source / start)
-        views = clod.load_scene(folder).train
-        tuned, _ = tune(pretrained.gaussians, views, Tuning(iters=ITERS, final=FINAL))
-        clod.save(base, tuned, pretrained)
-    return folder
+def trained(name, views):
+    """The file of a capture's base, trained now if it is not in the cache."""
+    base = CACHE / f"{name}-converged-{ROUNDS * ROUND + LAST}.ply"
+    if not base.exists():
+        CACHE.mkdir(parents=True, exist_ok=True)
+        random = np.random.default_rng(0)
+        model = pycolmap.Reconstruction(str(capture(name) / "sparse" / "0"))
+        gaussians = initial(model, min(COUNT, COUNT_EACH * len(views)), random)
+        for k in range(ROUNDS):
+            tuned, _ = tune(gaussians, views, Tuning(iters=ROUND, seed=k, final=1.0))
+            gaussians = relocated(tuned, random)
+        tuned, _ = tune(gaussians, views, Tuning(iters=LAST, seed=ROUNDS, final=0.01))
+        clod.save(base, tuned)
+    return base
 
 
-def run(folder, *, record):
-    """Adapts, measures and prints; with ``record`` adds the row to the results."""
-    base, scene = clod.load(folder / "base.ply"), clod.load_scene(folder)
-    with tempfile.TemporaryDirectory() as place:
-        out = Path(place) / "dial.ply"
-        process = clod_adapt(
-            base.path, "--images", folder, "--out", out, "--accept-loss", "--quiet"
-        )
-        report = report_of(out)
-        rows = quality(clod.load(out).gaussians, scene.test, DIALS)
-    row = {
-        "name": folder.name,
-        "photographs": len(scene.train),
-        "held_out": len(scene.test),
-        "gaussians": len(base.gaussians),
-        "base": report["base_rows"][0],
-        "rows": rows,
-        "steps": report["steps"],
-        "seconds": round(process.seconds, 1),
-    }
-    append(FILE, row, record)
+def initial(model, count, random):
+    """Gaussians at points of the model, each displaced by as much as its neighbours are away."""
+    xyz = np.array([point.xyz for point in model.points3D.values()])
+    rgb = np.array([point.color for point in model.points3D.values()]) / 255
+    distances = cKDTree(xyz).query(xyz, 4)[0][:, 1:].mean(1)
+    rows = random.permutation(np.resize(random.permutation(len(xyz)), count))
+    closer = min(1.0, (len(xyz) / count) ** (1 / 3))
+    sizes = np.maximum(distances[rows], 1e-6 * np.ptp(xyz)) * closer
+    means = xyz[rows] + random.normal(size=(count, 3)) * sizes[:, None]
+    return clod.Gaussians(
+        means=means.astype(np.float32),
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        log_scales=np.tile(np.log(sizes)[:, None], 3).astype(np.float32),
+        opacity_logits=np.full(count, np.log(OPACITY / (1 - OPACITY)), np.float32),
+        sh0=((rgb[rows] - 0.5) / SH_C0)[:, None].astype(np.float32),
+        shN=np.zeros((count, SH_COEFFICIENTS, 3), np.float32),
+    )
+
+
+def relocated(gaussians, random):
+    """Transparent Gaussians become copies of opaque ones, chosen by opacity; both have half the
+    optical depth.
+    """
+    opacities = gaussians.opacities.double().numpy()
+    dead = np.flatnonzero(opacities < TRANSPARENT)
+    alive = np.flatnonzero(opacities >= TRANSPARENT)
+    chosen = random.choice(alive, len(dead), p=opacities[alive] / opacities[alive].sum())
+    rows = np.arange(len(gaussians))
+    rows[dead] = chosen
+    copies = gaussians.select(torch.from_numpy(rows))
+    shared = np.isin(rows, chosen)
+    halved = 1 - np.sqrt(1 - np.minimum(opacities[rows], 0.99))
+    logits = np.where(shared, np.log(halved / (1 - halved)), copies.opacity_logits.numpy())
+    sizes = copies.log_scales.exp().numpy()
+    shifts = np.zeros((len(rows), 3))
+    shifts[dead] = random.normal(size=(len(dead), 3)) * 0.5 * sizes[dead].mean(1, keepdims=True)
+    return copies.replace(
+        means=(copies.means + torch.from_numpy(shifts)).float(),
+        opacity_logits=torch.from_numpy(logits).float(),
+    )
 
 
 def page_table():
-    """Bases that were trained on few photographs alone."""
-    rows, lines = [], []
-    for (name,), row in last(FILE, "name").items():
-        if name in SHOWN:
-            rows.append(row)
-            label = f"{SHOWN[name]}, {row['photographs']}"
-            lines.append([label, f"{row['base']['psnr']:.2f}", *map(psnr_kept, row["rows"])])
+    """The bases, and the dial of each."""
+    found = last(FILE, "name", "photographs")
+    lines = []
+    for (name, count), row in found.items():
+        head = f"{name}, {count}"
+        lines.append([head, f"{row['base']['psnr']:.2f}", *map(psnr_kept, row["rows"])])
     heads = ["capture, photographs", "base", *(f"s = {s:g}" for s in DIALS)]
-    return Table(heads, lines, rows)
+    return Table(heads, lines, found.values())
 
 
 if __name__ == "__main__":

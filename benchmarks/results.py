@@ -29,12 +29,14 @@ import choices
 import converged
 import file_formats
 import nophoto
+import paper
 import rasterize
 import rivals
 import robustness
 import scaling
 import stability
 import stream
+import tradeoff
 import walk
 from common import ROOT, SHARED, Table, about, arguments, last
 
@@ -44,13 +46,18 @@ LONG = 30  # minutes
 TABLES: dict[str, Callable[[], Table]] = {
     "adapt": adapt.page_table,
     "choices": choices.page_table,
+    "choices-placed": choices.placed_table,
     "converged": converged.page_table,
     "formats": file_formats.page_table,
     "nophoto": nophoto.page_table,
+    "paper-ablation": paper.page_table,
+    "paper-strips": paper.strips_table,
     "rasterize": rasterize.page_table,
     "robustness": robustness.page_table,
     "scaling": scaling.page_table,
     "scaling-memory": scaling.memory_table,
+    "stream-plain": stream.plain_table,
+    "tradeoff": tradeoff.page_table,
     "walk": walk.page_table,
 }
 for module, parts in (

@@ -17,10 +17,22 @@ from itertools import product
 
 import clod_adapter as clod
 from clod_adapter.report.charts import draw_training, new_figure, save_figure
-from common import ROOT, Row, append, arguments, checkpoint, last, photographs, quality, stored
+from common import (
+    ROOT,
+    Row,
+    Table,
+    append,
+    arguments,
+    checkpoint,
+    last,
+    photographs,
+    psnr_kept,
+    quality,
+    stored,
+)
 from tuning import Tuning, by_importance, merge, tune
 
-FILE = "tradeoff.jsonl"
+FILE, SCENE = "tradeoff.jsonl", "plush_half"  # of the page
 PICTURE = ROOT / "docs" / "images" / "error_vs_time.png"
 ITERS = (150, 400, 1200)
 MAX_SV, DIALS = 5.0, (1.0, 3.0, 5.0)
@@ -119,6 +131,18 @@ def curves(scene, k):
         for method, line in points.items()
         if line
     ]
+
+
+def page_table():
+    """Seconds and quality of each run; the seconds of specialists are those of all their files."""
+    found = last(FILE, "method", "iters", scene=SCENE)
+    lines = []
+    for (method, iters), row in found.items():
+        seconds = sum(row["seconds"]) if method == "specialist" else row["seconds"][0]
+        cells = map(psnr_kept, row["rows"])
+        lines.append([LABELS[method], f"{iters:,}", f"{seconds:.0f}", *cells])
+    heads = ["", "steps", "seconds", *(f"s = {s:g}" for s in DIALS)]
+    return Table(heads, lines, found.values())
 
 
 def plot(scene):

@@ -1,0 +1,132 @@
+"""The paper's ablations, and its comparison of continuous with discrete levels of detail.
+
+    python benchmarks/paper.py plush_half demo    # captures; the folder of clod-adapt demo
+
+Ablations: ``AdaptConfig.paper(max_sv=5)`` without the weight ``w_s``, without ``L_reg``, and
+without both. Levels: four strips of a picture from coarse to fine. Continuous is one file of this
+package at the dial values DIALS. Discrete is two models, two strips each: the base merged to the
+count of DIALS[0] and tuned for it, and the base; on average they draw as many Gaussians. A seam is
+the RMS difference, in 8-bit levels, between the renders of the two models that meet at a boundary
+of strips, in the columns next to it. Each run adds rows to ``results/paper.jsonl``; the demo is
+also drawn, to docs/images/strips.webp.
+"""
+
+from itertools import pairwise
+from pathlib import Path
+from unittest.mock import patch
+
+import clod_adapter as clod
+from clod_adapter.losses import decibels, mean_squared_error
+from clod_adapter.training.paper import PaperDial
+from common import ROOT, Table, append, arguments, last, opened, quality
+from tuning import merge
+
+import numpy as np
+import torch
+from PIL import Image
+
+FILE, PICTURE = "paper.jsonl", ROOT / "docs" / "images" / "strips.webp"
+MAX_SV, SHOWN = 5.0, (1.0, 3.0, 5.0)
+DIALS = (5.0, 2.0, 1.0, 0.0)  # of the strips, from left to right
+EDGE = 8  # columns on each side of a boundary
+ABLATIONS = {  # slope of w_s, and weight of L_reg
+    "as published": (PaperDial.weight_slope, 1.0),
+    "without `w_s`": (0.0, 1.0),
+    "without `L_reg`": (PaperDial.weight_slope, 0.0),
+    "without both": (0.0, 0.0),
+}
+
+
+def main():
+    parser = arguments(__doc__)
+    parser.add_argument("scenes", nargs="+")
+    for scene in parser.parse_args().scenes:
+        base, views = opened(scene)
+        name = Path(scene).name
+        for row in ablations(base, views):
+            append(FILE, {"kind": "ablation", "scene": name, **row})
+        pictures = []
+        for row, picture in strips(base, views):
+            append(FILE, {"kind": "strips", "scene": name, **row})
+            pictures.append(picture)
+        if name == "demo":
+            Image.fromarray(np.concatenate(pictures)).save(PICTURE, quality=90)
+
+
+def ablations(base, views):
+    for label, (slope, weight) in ABLATIONS.items():
+        config = clod.AdaptConfig.paper(max_sv=MAX_SV, reg_weight=weight)
+        with patch.object(PaperDial, "weight_slope", slope):
+            gaussians = clod.adapt(base.gaussians, views, config).gaussians
+        yield {"label": label, "rows": quality(gaussians, views.test, SHOWN)}
+
+
+def strips(base, views):
+    """A row and a picture of each way."""
+    adapted = clod.adapt(base.gaussians, views, clod.AdaptConfig(max_sv=MAX_SV)).gaussians
+    (coarsest,) = quality(adapted, views.test, DIALS[0])
+    merged, _ = merge(base, round(coarsest["kept"]), "--decimate")
+    tuned = clod.tune(merged, views.train)
+    for label, models in {
+        "discrete": [(tuned, 1.0)] * 2 + [(base.gaussians, 1.0)] * 2,
+        "continuous": [(adapted, s) for s in DIALS],
+    }.items():
+        row, picture = compare(models, views.test)
+        yield {"label": label, **row}, picture
+
+
+@torch.no_grad()
+def compare(models, views):
+    """PSNR of each strip, seams and share of the base, means over the views; and a picture."""
+    errors, seams, kept = [], [], []
+    for view in views:
+        drawn = [clod.render(model, view.camera, virtual_scale=s) for model, s in models]
+        images = [each.image.clamp(0, 1) for each in drawn]
+        kept.append(np.mean([int(each.kept.sum()) for each in drawn]))
+        edges = [round(k * view.camera.width / len(models)) for k in range(len(models) + 1)]
+        strips = [slice(*ends) for ends in pairwise(edges)]
+        pairs = [
+            (image[:, strip], view.image[:, strip])
+            for image, strip in zip(images, strips, strict=True)
+        ]
+        errors.append([mean_squared_error(*pair) for pair in pairs])
+        seams.append([])
+        for (left, right), edge in zip(pairwise(images), edges[1:-1], strict=True):
+            near = slice(edge - EDGE, edge + EDGE)
+            difference = (left[:, near] - right[:, near]).square().mean().sqrt()
+            seams[-1].append(255 * float(difference))
+    joined = torch.cat([image[:, strip] for image, strip in zip(images, strips, strict=True)], 1)
+    row = {
+        "psnr": [decibels(error) for error in np.mean(errors, 0)],
+        "seams": np.mean(seams, 0).tolist(),
+        "kept": float(np.mean(kept)),
+    }
+    return row, (255 * joined).round().byte().numpy()
+
+
+def page_table():
+    """The ablations at SHOWN."""
+    found = last(FILE, "scene", "label", kind="ablation")
+    lines = []
+    for key, row in found.items():
+        cells = [
+            f"{at['psnr']:.2f}, {at['ssim']:.3f}, {at['kept_share']:.0%}" for at in row["rows"]
+        ]
+        lines.append([", ".join(key), *cells])
+    return Table(["PSNR, SSIM, kept", *(f"s = {s:g}" for s in SHOWN)], lines, found.values())
+
+
+def strips_table():
+    """PSNR of the strips, and the seams between them."""
+    found = last(FILE, "scene", "label", kind="strips")
+    lines = []
+    for key, row in found.items():
+        psnrs = " / ".join(f"{each:.1f}" for each in row["psnr"])
+        seams = " / ".join(f"{each:.1f}" for each in row["seams"])
+        lines.append([", ".join(key), psnrs, seams, f"{row['kept']:,.0f}"])
+    heads = ["levels of detail", "PSNR of the strips", "seams, levels", "Gaussians, mean"]
+    return Table(heads, lines, found.values())
+
+
+if __name__ == "__main__":
+    main()
