@@ -171,7 +171,7 @@ class Dial:
             return int(dial(self.gaussians, distances, s).keep.sum())
 
         low, high = 1e-3, 1e3
-        for _ in range(40):
+        for _ in range(24):
             s = math.sqrt(low * high)
             low, high = (s, high) if kept(s) > count else (low, s)
         return self.gaussians, high, kept(high)
