@@ -56,7 +56,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "robustness": robustness.page_table,
     "scaling": scaling.page_table,
     "scaling-memory": scaling.memory_table,
-    "stream-plain": stream.plain_table,
+    "stream": stream.plain_table,
     "tradeoff": tradeoff.page_table,
     "walk": walk.page_table,
 }
