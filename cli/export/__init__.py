@@ -102,7 +102,7 @@ def check(args: Namespace) -> None:
         ),
         (folder and args.order, f"{folder} sorts the Gaussians itself; remove --order"),
         (
-            args.camera is not None and args.images is None,
+            args.camera and args.images is None,
             "--camera needs the scene of the photograph; give --images too",
         ),
         (
@@ -110,7 +110,7 @@ def check(args: Namespace) -> None:
             f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order",
         ),
         (
-            args.camera is not None and not bakes,
+            args.camera and not bakes,
             "--camera needs a dial value to bake; give one, as in --sv 2",
         ),
         (
