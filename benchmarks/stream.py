@@ -41,7 +41,8 @@ LEAF, HALVED = 8192, 6  # Gaussians of a node; times that SCENE is halved
 BEHIND = 1.5  # factor of the distance of what is straight behind the camera: lodBehindPenalty
 SETS = {"halved": "--decimate", "halved adaptively": "--decimate-adaptive"}
 SCENES = {  # of the tables
-    "taebak4": "an aerial scene of 212,464",
+    "taebak4": "an aerial scene of 212,464, the coarsest level of a larger one",
+    "taebak": "that larger one, 4,249,286",
     "garden2": "a garden of 843,068 by another author",
     "showroom3": "a showroom of 747,000 by that author",
     "playbot": "a robot of 500,000, SH degree 2 (PLAYBOT by Stephane Agullo, CC BY 4.0)",
@@ -50,6 +51,7 @@ SCENES = {  # of the tables
 }
 SHOWN = {
     "dial": "this dial, one file",
+    "dial, all alike": "the same, all directions alike",
     "lod-meta": "this file's levels, `export --lod-meta`",
     "halved": "halved uniformly",
     "halved adaptively": "halved adaptively",

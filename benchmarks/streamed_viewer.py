@@ -87,9 +87,10 @@ const set = () => {
   return [...layer.gsplatManager.world._octreeInstances.values()][0];
 };
 window.nodes = () => {
-  const nodes = set().octree.nodes, point = ({ x, y, z }) => [x, y, z];
-  const low = nodes.map((node) => point(node.bounds.getMin()));
-  const high = nodes.map((node) => point(node.bounds.getMax()));
+  const { nodes, nodeBoundsMinMax: ends, nodeBoundsExcess: excess } = set().octree;
+  const shrunk = (k, at, sign) => [0, 1, 2].map(
+    (i) => ends[6 * k + at + i] + sign * settings.lodDistanceShrink * excess[3 * k + i]);
+  const low = nodes.map((_, k) => shrunk(k, 0, 1)), high = nodes.map((_, k) => shrunk(k, 3, -1));
   return [low, high, nodes.map((node) => node.lods.map((level) => level.count))];
 };
 window.drawn = () => {
