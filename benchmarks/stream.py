@@ -299,7 +299,7 @@ def page_table(scene):
             rows += filter(None, line)
             # none where a set cannot be so small: nodes around the camera stay at its finest level
             lines[label] = [
-                row["psnr"] if row and row["share"] < 1.2 * budget else None
+                row["psnr"] if row and row["share"] < 1.01 * budget else None
                 for row, budget in zip(line, BUDGETS, strict=True)
             ]
     heads = [f"{SCENES[scene]} (`{scene}`), budget", *percent(BUDGETS)]

@@ -21,6 +21,7 @@ from clod_adapter.equation.attenuation import (
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
+from clod_adapter.initialization.merging import merge
 
 # Exponents of the dial value that opacities and scales are baked at for several cameras: the best
 # on held-out photographs of FADED 0, 0.5, 0.75 and 1, and then of seven GROWN from 0 to 1.25. At
@@ -48,7 +49,8 @@ def bake(
     becomes ``OPAQUE``. For one ``camera`` the image from there equals the rendering at s. For
     ``cameras`` each Gaussian has one distance (``distances.typical_distance``): those kept there at
     s are kept, with the opacities of ``s^FADED``, as fading only prevents popping, and then the
-    scales of ``s^GROWN``.
+    scales of ``s^GROWN``. Beyond ``max_sv``, where nothing was trained, those of ``max_sv`` are
+    merged until as many remain as s keeps (``merging.merge``).
 
     Args:
         virtual_scale: the dial s >= 0; ``dial_for(gaussians, keep=n, cameras=cameras, baked=True)``
@@ -84,7 +86,11 @@ def bake(
         grown = dial(gaussians, distances, virtual_scale**GROWN)
     if not kept.keep.any():
         raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g}; bake a smaller s")
-    return _plain(gaussians, kept, shown, grown)
+    trained = gaussians.attenuation.max_sv
+    if camera or virtual_scale <= trained:
+        return _plain(gaussians, kept, shown, grown)
+    smallest = bake(gaussians, trained, cameras=cameras)
+    return merge(smallest, torch.ones(len(smallest)), int(kept.keep.sum()))
 
 
 class Level(NamedTuple):

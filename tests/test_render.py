@@ -125,6 +125,20 @@ def test_several_cameras_share_one_distance_per_gaussian():
     assert torch.equal(bake(model, s, cameras=places).means, baked.means)
 
 
+def test_beyond_the_trained_range_the_smallest_file_is_merged():
+    model = spread(max_sv=2.0)
+    smallest = bake(model, 2.0, cameras=[camera()])
+    count = int(render(model, camera(), virtual_scale=6.0).kept.sum())
+    merged = bake(model, 6.0, cameras=[camera()])
+    assert len(merged) == count and 0 < count < len(smallest) / 2
+    want = render(smallest, camera()).image
+
+    def error(gaussians):
+        return float((render(gaussians, camera()).image - want).square().mean())
+
+    assert error(merged) < error(smallest[:count]) / 2
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_autocast_changes_nothing(form):
     model = spread(form=form)

@@ -100,7 +100,7 @@ def choose_dials(given: list[float] | None, model: Checkpoint, console: Console)
     trained = attenuation.max_sv
     dials = given or [*(s for s in DIALS if s < trained), trained]
     if max(dials) > trained:
-        console.note(f"trained up to s = {trained:g}; larger dial values were not trained")
+        console.note(f"trained up to s = {trained:g}; beyond, the dial is untrained")
     return dials
 
 
