@@ -94,7 +94,7 @@ def kept(at, many, stored, drawing):
     """The bits of those of ``many`` <= 16 rows from ``at`` on that are in front of the camera and
     not culled.
 
-    Activated opacities are 1/255 at least.
+    Activated ones are told by their opacity alone, from 1/255 on.
     """
     dial = drawing.dial
     if dial.activated:
@@ -172,11 +172,11 @@ def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
     """Gradients of logit, sigma and growth of sixteen rows; makes those of the scales in ``g`` of
     their logarithms.
 
-    With w the gradient of the logarithm of the drawn opacity (``equation/attenuation.py``), per
-    Gaussian::
+    ``w`` is as in ``drawn``, ``g`` the sums over pixels. With v, the gradient of the logarithm of
+    the drawn opacity (``equation/attenuation.py``), per Gaussian::
 
-        dL/dlogit    = w sigmoid(-logit)
-        dL/dsigma    = w 4 t^4 / ((1 - t^4) sigma)      distances are constants
+        dL/dlogit    = v sigmoid(-logit)
+        dL/dsigma    = v 4 t^4 / ((1 - t^4) sigma)      distances are constants
         dL/dlogscale = dL/dscale scale
         dL/dgrowth   = sum of dL/dlogscale, times log m         0 where the growth is clamped
 

@@ -101,10 +101,12 @@ def attenuate(
     hooks all call this.
 
     Differentiable in ``opacities``, ``sigma_d`` and ``growth_d``, not in distances. Without a
-    ``sigma_d`` all are kept and drawn with a. A Gaussian kept at s is kept at every smaller dial.
+    ``sigma_d`` or ``config`` all are kept, drawn with a, and nothing grows. In the equation above,
+    what is kept at s is kept at every smaller dial value, except far Gaussians.
 
     Args:
         opacities: ``[N]`` logits.
+        sigma_d: ``[N]`` reaches R, in the units of distances.
         seen_from: ``[N]`` distances d (``distances.normalized_distances``), or the centres
             ``[N, 3]``, world units, and the camera. Pass distances to use them for several dial
             values.
@@ -116,7 +118,7 @@ def attenuate(
         ClodError: the dial is negative or not finite, or the shapes differ.
     """
     check_dial(virtual_scale)
-    virtual_scale = float(virtual_scale)  # of a numpy array
+    virtual_scale = float(virtual_scale)  # it may be a numpy scalar or a 0-d array
     if sigma_d is None or config is None:
         a = opacities if activated else opacities.sigmoid()
         return Attenuated(a, torch.ones_like(a, dtype=torch.bool), torch.ones_like(a))
@@ -145,7 +147,7 @@ def reach_fade(sigma_d: Tensor, far: Tensor, near: float = 0.0) -> tuple[Tensor,
     """
     keep = (far < sigma_d) | (far == 0)
     fades = keep & (far > 0)
-    # 1 / 1 where it is culled, without a gradient
+    # t is 1 / 1 where a Gaussian is culled, which has no gradient, and 0 / 1 where d s is 0
     t = torch.where(keep, far, 1) / sigma_d.double().where(fades, 1)
     fade = 1 - t.square().square()  # as a product, the slope of a small t would cancel
     if near == 0:
@@ -157,9 +159,7 @@ def reach_fade(sigma_d: Tensor, far: Tensor, near: float = 0.0) -> tuple[Tensor,
 
 
 def takeover(far: Tensor, near: float) -> Tensor:
-    """w, in [0, 1]: how far the far Gaussians have taken over from the near ones at d
-    s = ``far``.
-    """
+    """w, in [0, 1]: the share that far Gaussians have taken over from near ones; ``far`` is d s."""
     progress = (far / near).square() * TAKEOVER - (TAKEOVER - 1)
     return progress.clamp(0, 1)
 
@@ -176,8 +176,9 @@ def kept_between(
     distances: Tensor,
     baked: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    """``[N]`` twice, float64: the dial values between which each is kept at its distance d ``[N]``,
-    the end excluded; in the equation, or with ``baked`` in a plain file.
+    """``[N]`` float64 twice, begin and end of the dial values at which each Gaussian is kept at its
+    distance d ``[N]``, the end excluded: by the equation, or with ``baked`` in the file that
+    ``bake`` makes, where near and far ones change at once, in the middle of the zone.
     """
     config = gaussians.attenuation
     assert gaussians.sigma_d is not None and config is not None

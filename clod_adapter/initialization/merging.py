@@ -26,7 +26,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.neighbours import nearest, without_crowds
 from clod_adapter.progress import Listener, Phase, tell
 
-NEIGHBOURS = 12
+NEIGHBOURS = 12  # of each Gaussian, with which it may be merged in a round
 COLOUR = 2.0  # weight of the squared difference of harmonics
 ROUND = 0.25  # of the remaining that one round removes at most
 LEAST = 1e-3  # of a cost, and share of the mean importance: below, differences do not matter
@@ -74,9 +74,9 @@ def merge(
     are no more.
 
     Args:
-        importance: ``[N]``, at least 0, what a Gaussian matters to the pictures; merged ones have
-            the sum. Without it what nobody sees takes as many of the merged ones as what everybody
-            sees: 0.5 dB.
+        importance: ``[N]``, at least 0, how much a Gaussian matters to the pictures; merged ones
+            have the sum. Without it, what nobody sees would get as many of the merged ones as what
+            everybody sees, which costs 0.5 dB.
     """
     mixture = mixture_of(gaussians)
     before = len(gaussians)
@@ -132,8 +132,8 @@ def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
 
 
 def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
-    """``[N]`` the number of each one's group: pairs, the cheapest first, until ``count`` groups
-    remain, or singles.
+    """``[N]`` the number of each Gaussian's group, a pair or a single one: the cheapest pairs,
+    until ``count`` groups remain or there are no more pairs.
     """
     partner = np.arange(len(mixture))
     remaining = len(mixture)
@@ -149,8 +149,8 @@ def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pairs of neighbours without a common one: the cheapest of both each, by rising cost, then of
-    what remains.
+    """Pairs of neighbours in rounds, each Gaussian in one pair at most: a round has the pairs that
+    are the cheapest for both of their Gaussians among those that are still free, by rising cost.
     """
     i, j = _neighbours(mixture)
     total = np.maximum(weights[i] + weights[j], np.finfo(float).tiny)
@@ -173,7 +173,9 @@ def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarra
 
 
 def _neighbours(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
-    """Each pair of a Gaussian and one of its NEIGHBOURS nearest once, the smaller number first."""
+    """The pairs of a Gaussian and one of its nearest NEIGHBOURS, each pair once: the smaller rows,
+    and the larger ones.
+    """
     sizes = np.sqrt(mixture.covariances.max((1, 2)))  # the largest is on the diagonal
     pairs = []
     for rows, _, near in nearest(without_crowds(mixture.means, sizes), NEIGHBOURS):

@@ -29,7 +29,9 @@ FASTEST = 1e18  # rate of a dial, whose square float32 holds
 
 
 def drawing_of(camera: Camera, screen_filter: ScreenFilter, dial: Dial, **more: Any) -> Drawing:
-    """Settings for the kernels."""
+    """Settings for the kernels. Rays are clamped to the image and 15 % of its size around it, as
+    Inria's and gsplat's rasterizers clamp them for the Jacobian of the projection.
+    """
     viewmat = float64_array(camera.viewmat)
     K = float64_array(camera.K)
     fx = K[0, 0]
@@ -63,7 +65,9 @@ def drawing_of(camera: Camera, screen_filter: ScreenFilter, dial: Dial, **more: 
 
 
 def dial_of(config: AttenuationConfig | None, virtual_scale: float) -> Dial:
-    """A dial value for the kernels."""
+    """A dial value for the kernels: squares of s / D, of s / (D r), and of 1 / H, with the
+    unit of distances D, the start of growth r and the end of near Gaussians H, both in D.
+    """
     if config is None:
         return Dial()
     rate = virtual_scale / config.scene_distance
@@ -112,6 +116,7 @@ class ForwardState:
         histogram = np.zeros((listing, across * down), np.int64)
         totals = np.zeros(listing, np.int64)
         listed = self.packed.records, order, across, histogram, totals
+        # only counts the entries, as there is no room for them yet
         threads.run(tiles.list_tiles, listing, *listed, *[np.empty(0, np.int32)] * 3)
         # from counts to first entries, tile by tile and in a tile worker by worker
         ends = histogram.T.cumsum().reshape(-1, listing)
@@ -195,7 +200,7 @@ class _Picture(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor):  # type: ignore[no-untyped-def, override]
         image, alpha, *inputs = ctx.saved_tensors
         frame: ForwardState = ctx.frame
-        need = Stored(*ctx.needs_input_grad[5:])
+        need = Stored(*ctx.needs_input_grad[5:])  # after the five arguments before ``inputs``
         # Unused sums are skipped. Above SH degree 0, a mean changes the colour too.
         shaped = need.means or need.quats or need.scales or need.growth
         colored = need.sh0 or need.shN or (shaped and frame.drawing.degree > 0)

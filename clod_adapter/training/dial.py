@@ -50,15 +50,16 @@ class Dial(nn.Module):
     Attributes:
         log_sigma: ``[N]`` parameter, the logarithm of sigma_d.
         growth_d: ``[N]`` parameter, or None if the config has no growth.
-        attenuation: settings of both; distances are in units of the reference distance.
+        attenuation: settings of the equation that reads both; distances are in units of the
+            reference distance.
         config: settings of the training.
-        typical: ``[N]`` normalised distances at which Gaussians are counted; no view's own, whose
-            counts differ from the mean's: gradients that correct such differences cancel out, and
-            only add noise.
+        typical: ``[N]`` normalised distances at which Gaussians are counted, typical of all views.
+            At one view's own distances the counts differ from their mean; the gradients that would
+            correct such differences cancel out over the views, and only add noise.
     """
 
-    # The parameter that sigma_d is trained through, and others whose culled rows have gradients
-    # too.
+    # decay: name of the parameter that sigma_d is trained through; everywhere: of the others whose
+    # culled rows have gradients too; limits: of ``decay``; weight_slope: k of ``weight``.
     decay: ClassVar[str] = "log_sigma"
     everywhere: ClassVar[frozenset[str]] = frozenset()
     limits: ClassVar[tuple[float, float]] = (math.log(SIGMA_RANGE[0]), math.log(SIGMA_RANGE[1]))
@@ -95,7 +96,7 @@ class Dial(nn.Module):
             config = replace(config, start_share=1.0)
             self.trained = len(start) - start.whole
             self.total = start.whole
-        self._counted = config
+        self._counted = config  # of the target-count curve
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
         self.growth_d = None
         if start.growth_d is not None:
@@ -254,8 +255,8 @@ class Dial(nn.Module):
 
     @torch.no_grad()
     def count_gradient(self, parameter: Tensor, virtual_scale: float, loss: Tensor) -> Tensor:
-        """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, of the
-        trained rows.
+        """``[trained]`` the count term's gradient by the parameter ``decay`` at one dial value, for
+        the trained rows.
         """
         sigma = self.sigma_of(parameter)
         target = self.target_share(virtual_scale)
@@ -348,7 +349,7 @@ def require_trainable(
     config: AdaptConfig,
     processes: int = 1,
 ) -> None:
-    """Raises ClodError if there is nothing to train, or on nothing, or a value is not finite."""
+    """Raises ClodError if there are no Gaussians or views to train, or a value is not finite."""
     if not scene.train:
         raise ClodError(
             "the scene has no training views: give at least one photograph that is not held out"

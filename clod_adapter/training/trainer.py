@@ -96,8 +96,10 @@ class Trainer:
         self._updating = False
 
     def _optimizers(self, sizes: Tensor) -> dict[str, RowAdam]:
-        """Those of the parameters that move where the dial keeps the row, and that move always: the
-        count term has a gradient of culled Gaussians too. ``sizes`` are units of the means.
+        """Two, by the rows that they move: ``kept``, those that the dial keeps, and ``all``, for
+        the parameters of which culled rows have a gradient too, from the count term.
+
+        ``sizes [N]``: the Gaussians' own, in units of which their means move.
         """
         parameters_by_rows = {"kept": self.trained(), "all": dict[str, Tensor]()}
         for name in (self.dial.decay, *self.dial.everywhere):
@@ -131,7 +133,7 @@ class Trainer:
                 gradients = self.gradient_sum(samples, until)
             self._updating = True
             self._update(gradients, share_done)
-            # the host waits for a GPU, as else only gsplat does
+            # float() waits for a GPU, the one time in a step besides what gsplat does
             loss = float(gradients.loss) / gradients.views
             if not math.isfinite(loss):
                 self._updating = False
@@ -191,8 +193,8 @@ class Trainer:
         return GradientSum(gradients, kept, unweighted)
 
     def _update(self, total: GradientSum, share_done: float) -> None:
-        """Moves the rows whose gradients are finite; none if the loss is not, without asking
-        which.
+        """Moves the rows whose gradients are finite, and none if the loss is not. On a GPU nothing
+        here waits for these results.
         """
         loss_finite = torch.as_tensor(total.loss).isfinite()
         nonfinite = nonfinite_rows(*total.gradients.values())
@@ -254,6 +256,7 @@ class Trainer:
         return in_world_units(gaussians)
 
     def _assembled(self, parameters: dict[str, Tensor]) -> Gaussians:
+        """Gaussians with their dial from parameters by name, in the order and units of training."""
         values: Any = {name: parameters[name] for name in ATTRIBUTES}
         return Gaussians(
             **values,
