@@ -1,7 +1,7 @@
 """Budgets: the dial value for a number of Gaussians, a PSNR drop, or a frame rate.
 
 - A count needs no measurement: from one camera a Gaussian is kept between two dial values, and the
-  count is bisected. Exact but for dial values that are equal.
+  count is bisected. Exact unless several Gaussians begin or end at one dial value.
 - PSNR is read from the quality table that is stored with the file (``quality_table.py``).
 - Frame rates depend on the machine, the image size and the load: frames are timed, from cameras.
   The table's times are used only where they are passed in, or (``clod-adapt export``) where nothing
@@ -75,8 +75,8 @@ def dial_for(
 
     Raises:
         ClodError: not exactly one budget, a budget that is not positive, no dial, no data for the
-            budget, or one that no dial value reaches, or of a frame rate the largest trained one;
-            the message gives its value there.
+            budget, a count that no dial value meets, or a frame rate that max_sv does not; the
+            message then gives what is reached.
 
     Example:
         >>> model = clod.load("model.ply")

@@ -46,10 +46,13 @@ Documented = TypeVar("Documented", bound=Callable[..., Any])
 
 
 def _of_gsplat(documented: Documented) -> Documented:
-    """gsplat's function of the same name with the four arguments."""
+    """gsplat's function of the same name with the four arguments; of ``documented`` only name,
+    types and docstring are used.
+    """
     name = documented.__name__
     projection = inspect.signature(gsplat.fully_fused_projection).parameters
-    # a projection that knows opacities culls those of 0 itself
+    # whether culled Gaussians must be moved out of view: a projection that takes opacities leaves
+    # out those of 0 itself
     hide = not (name == "rasterization" and "opacities" in projection)
 
     @functools.wraps(documented)

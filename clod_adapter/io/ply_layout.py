@@ -37,8 +37,7 @@ if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
 
 PREFIX = "clod_adapter "
-COLUMN = "clod_"
-# of settings
+COLUMN = "clod_"  # prefix of the columns of settings, which are
 REFERENCE = "clod_reference_distance"
 NEAR = "clod_near_distance"
 PAPER = "clod_paper"
@@ -53,6 +52,7 @@ VIEWPOINT = "viewpoint"
 DIAL_GROUP = "attenuation"
 # the columns of ``settings.EARLIER``
 _EARLIER = {"clod_tau", "clod_eps", "clod_hard_cut", "clod_max", "clod_quantile"}
+# by attribute, what to store instead of a value that is not finite
 _INSTEAD = {SIGMA: "use a large number for no end", GROWTH: "use 0 for no growth"}
 
 
@@ -81,7 +81,9 @@ def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
 def ply_metadata(
     path: Path, comments: tuple[str, ...], rows: np.ndarray | None = None, *, dial: bool
 ) -> Metadata:
-    """The settings of the comments, completed by those of the columns of ``rows``."""
+    """The settings of the comments, completed by those of the columns of ``rows``; ``dial``: there
+    is a sigma_d.
+    """
     values = _stored_settings(comments)
     ours = any(comment.startswith(PREFIX) for comment in comments)
     columns = {}
@@ -238,7 +240,7 @@ def write_rows(
     dial = dial_columns(tensors)
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
     names = layout.names or ()
-    # growth_d alone is foreign
+    # growth_d without sigma_d is another program's column, and stays
     dropped = {FILTER_3D, *((SIGMA, GROWTH, OPACITY) if dial else dial_columns(names))}
     copied = [name for name in names if name not in dropped and not name.startswith(COLUMN)]
     kinds = {name: layout[name] for name in copied}

@@ -129,8 +129,8 @@ class Payload:
             yield rows.float().cpu().numpy().astype("<f4", copy=False).tobytes()
 
     def content(self, file: str, exact: bool) -> tuple[bytes, Gaussians, tuple[str, ...]]:
-        """The splat as PLY, if ``exact``, or as SPZ, of which rows that are near one another take a
-        tenth less.
+        """The splat as PLY, if ``exact``, or as SPZ, with rows along a curve: where neighbours are
+        next to one another, it takes a tenth less.
 
         ``file`` is a temporary name. Returns the bytes, the Gaussians in them, and a line for each
         loss.

@@ -56,19 +56,19 @@ EXTENDED = 2  # flag of records after the arrays
 MOST_GAUSSIANS = 10_000_000  # Gaussians that the reference reads
 COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
-# of the components of a rotation: the others than each, and where their bits begin
+# by the largest component of a rotation, the three others, and at which bits these begin
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 _SHIFTS = [20, 10, 0]
-_STEP = 4  # of the harmonics, which have 6 bits
-_MOST = float(np.finfo(np.float16).max)
-# world units: a reference distance, from which on some sigma_d that fade at high dial values exceed
-# that
+_STEP = 4  # of the bytes of harmonics, of which 6 bits are used
+_MOST = float(np.finfo(np.float16).max)  # 65504, of the columns of the dial
+# Reference distance, world units, above which sigma_d is stored in units of it: in world units some
+# that still fade at high dial values would exceed _MOST.
 _FAR = 25.0
 QUANTISED = (
     "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
 )
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
-_SMALL = 1 << 24  # bytes that any file may
+_SMALL = 1 << 24  # bytes that any file may unpack to
 
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
@@ -140,6 +140,7 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
 
 
 def _packed(arrays: dict[str, np.ndarray], bits: int) -> list[bytes]:
+    """The arrays in the order of the file; positions have ``bits`` for the fraction."""
     # Far beyond what a byte has room for, but not so far that it overflows.
     sh0 = np.clip(arrays["sh0"], -9, 9)
     harmonics = np.clip(arrays["shN"], -9, 9)
@@ -170,6 +171,9 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def _losses(arrays: dict[str, np.ndarray], bits: int) -> list[str]:
+    """A line for each loss. The limits are the ranges of the bytes and a little more: -2.03125 is
+    the middle of the logarithms of scales, -10 to 5.9375.
+    """
     notes = [
         f"positions are rounded to {2.0**-bits:.1g}, colours, opacities, scales and rotations to"
         " about 8 bits",
@@ -259,6 +263,7 @@ def _ours(body: bytes, count: int) -> tuple[dict[str, Any], dict[str, np.ndarray
 
 
 def _unquantized(columns: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
+    """The inverse of ``_packed``, of ``[N, bytes]`` columns."""
     means, opacities, colors = columns[:3]
     scales, quats, harmonics = columns[3:]
     wide = np.zeros((len(means), 3, 4), np.uint8)
