@@ -25,8 +25,8 @@ from ..shared.process import ignore_signals, launched
 from .prepare import Run, against_forecast, decide, forecast
 from .processes import BACKENDS, explain, must_exit_soon, training_group
 
-# dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is
-# told and what fails.
+# Limits in dB, the one beyond which s = 1 has a warning, and the one beyond which the run fails:
+# LOST below the base on photographs, ENOUGH against the checkpoint's renderings without them.
 LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
 
 

@@ -41,6 +41,7 @@ from ..shared.outputs import Report, size
 from .names import AGREE, CONVERTED, FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 
 PLACED = 16  # cameras placed where none are known
+# by the option of a set, what to set in its viewer: printed after it is written
 SETTINGS = {
     "--lod-meta": (
         "in PlayCanvas: lodBaseDistance = {begins:.4g}, lodMultiplier = {multiplier:g},"
@@ -113,7 +114,8 @@ class Export:
             inputs.read_model(args, path, self.console, self.model.origin, device)
             for path in args.others
         ]
-        # to bake or fit for, none where nothing is; in printable ASCII
+        # cameras to bake or fit for, none where that is not asked for, and what they are: in
+        # printable ASCII, as it becomes a comment of the file
         self.cameras, self.about = self._find_cameras()
         reads = self.page and args.images is not None  # cameras of the scene, for a page
         self.views = inputs.read_cameras(self.model, args.images, self.console) if reads else []
@@ -283,14 +285,14 @@ class Export:
         return gaussians, tuple(dict.fromkeys(about))
 
     def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:
-        """Writes a file, with notes on losses of the format; its number of Gaussians."""
+        """Writes a file, with notes on losses of the format; returns its number of Gaussians."""
         if suffix == PAGE:
             self._write_page(path, virtual_scale)
             return sum(model.gaussians.whole for model in (self.model, *self.others))
         gaussians, about = self._content(virtual_scale)
         if suffix in CONVERTED:
             with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
-                # suffix: the format
+                # splat-transform tells the format by the suffix
                 source, packed = Path(folder) / "plain.ply", Path(folder) / f"packed{suffix}"
                 write(source, gaussians, Metadata(about=about))
                 self._transform([source], packed, len(gaussians))
@@ -307,7 +309,7 @@ class Export:
         return gaussians.whole
 
     def _write_set(self, index: Path) -> list[Level]:
-        """Writes a streaming or 3D Tiles set to the folder of ``index``; its levels."""
+        """Writes a streaming or 3D Tiles set to the folder of ``index``; returns its levels."""
         levels = bake_levels(self.gaussians, self.args.multiplier)
         if self.args.folder == "--3dtiles":
             self.console.note(*write_tileset(index.parent, levels, origin=self.model.origin))
@@ -323,7 +325,7 @@ class Export:
         return levels
 
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
-        """Notes the PSNR of its renders against those of the exact Gaussians."""
+        """Writes a page, and notes the PSNR of its renders against those of the exact Gaussians."""
         inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
         shown, losses = write_viewer_page(
             path,
