@@ -225,11 +225,11 @@ class _Picture(torch.autograd.Function):
             ctx.trained,
             Stored(*_arrays(gradients)),
         )
-        behind = None
+        background = None
         if ctx.needs_input_grad[4]:
-            behind = ((1 - alpha)[..., None] * slopes[0]).sum((0, 1))
+            background = ((1 - alpha)[..., None] * slopes[0]).sum((0, 1))
         requested = [g if needed else None for g, needed in zip(gradients, need, strict=True)]
-        return None, None, None, None, behind, *requested
+        return None, None, None, None, background, *requested
 
 
 class _Compiled(Rasterizer):
