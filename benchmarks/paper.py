@@ -97,7 +97,7 @@ def compare(models, views):
             seams[-1].append(255 * float(difference))
     joined = torch.cat([image[:, strip] for image, strip in zip(images, strips, strict=True)], 1)
     row = {
-        "psnr": [decibels(error) for error in np.mean(errors, 0)],
+        "strips": [decibels(error) for error in np.mean(errors, 0)],
         "seams": np.mean(seams, 0).tolist(),
         "kept": float(np.mean(kept)),
     }
@@ -121,7 +121,7 @@ def strips_table():
     found = last(FILE, "scene", "label", kind="strips")
     lines = []
     for key, row in found.items():
-        psnrs = " / ".join(f"{each:.1f}" for each in row["psnr"])
+        psnrs = " / ".join(f"{each:.1f}" for each in row["strips"])
         seams = " / ".join(f"{each:.1f}" for each in row["seams"])
         lines.append([", ".join(key), psnrs, seams, f"{row['kept']:,.0f}"])
     heads = ["levels of detail", "PSNR of the strips", "seams, levels", "Gaussians, mean"]
