@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import clod_adapter as clod
-from clod_adapter.equation.attenuation import dial
+from clod_adapter.equation.attenuation import dial, smallest_dial
 from clod_adapter.losses import decibels, mean_squared_error
 from common import Table, append, arguments, clod_adapt, last, percent, with_best
 from tuning import TIMEOUT, find_tool
@@ -172,11 +172,8 @@ class Dial:
         def kept(s):
             return int(dial(self.gaussians, distances, s).keep.sum())
 
-        low, high = 1e-3, 1e3
-        for _ in range(24):
-            s = math.sqrt(low * high)
-            low, high = (s, high) if kept(s) > count else (low, s)
-        return self.gaussians, high, kept(high)
+        s = smallest_dial(lambda s: kept(s) <= count, 1e-3, 1e3, 1e-6)
+        return self.gaussians, s, kept(s)
 
 
 @dataclass
