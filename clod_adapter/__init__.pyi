@@ -6,7 +6,6 @@ from .adapter import extract as extract
 from .adapter import with_dial as with_dial
 from .bake import bake as bake
 from .bake import bake_levels as bake_levels
-from .bake import order_by_extinction as order_by_extinction
 from .cameras import Camera as Camera
 from .cameras import Scene as Scene
 from .cameras import View as View

@@ -1,6 +1,4 @@
-"""Plain Gaussians from adapted ones: one dial value baked into the opacities; and rows in the order
-of the dial.
-"""
+"""Plain Gaussians from adapted ones: one dial value baked into the opacities."""
 
 import math
 from collections.abc import Sequence
@@ -159,40 +157,6 @@ def _plain(
     return gaussians.replace(**baked, sigma_d=None, growth_d=None, attenuation=None).select(
         kept.keep
     )
-
-
-@torch.no_grad()
-def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tensor:
-    """``[N]`` int64, the rows by descending extinction scale ``sigma_d / d``, for renderers that
-    draw a prefix.
-
-    Ties stay in order; where d is 0 it is infinite. With ``gaussians.select(rows)`` the first n are
-    those that ``bake`` keeps for the cameras.
-
-    Raises:
-        ClodError: no dial, no camera, or the paper's form.
-
-    Example:
-        >>> base, scene = clod.load("base.ply"), clod.load_scene("scene")
-        >>> model = clod.attach(base.gaussians, scene).gaussians()
-        >>> rows = clod.order_by_extinction(model, [view.camera for view in scene.train])
-        >>> first = model[rows[:1000]]
-    """
-    if gaussians.sigma_d is None or gaussians.attenuation is None:
-        raise ClodError("the Gaussians have no sigma_d, so there is no pruning order")
-    if gaussians.near is not None:
-        raise ClodError(
-            "near and far Gaussians have no order: far ones begin where near ones end; bake dial"
-            " values"
-        )
-    if gaussians.attenuation.form == "paper":
-        raise ClodError(
-            "in the paper's form rows have no order: the cut depends on opacity; adapt with --form"
-            " ours"
-        )
-    distances = typical_distance(gaussians.means, cameras, gaussians.attenuation)
-    scales = torch.where(distances > 0, gaussians.sigma_d.double() / distances, torch.inf)
-    return scales.argsort(descending=True, stable=True)
 
 
 def _of_several(

@@ -145,7 +145,6 @@ EXPORT = """
 --levels 1,,2
 --levels 1,1
 --camera ../x --images scene
---order x
 """
 
 

@@ -15,7 +15,7 @@ import gsplat_in_torch
 from clod_adapter import Hook, Scene, attach, dial_for, evaluate, make_plan, render
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.alignment.check import check_alignment
-from clod_adapter.bake import bake, order_by_extinction
+from clod_adapter.bake import bake
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.evaluation.budget import frame_times, matching_dial
@@ -110,7 +110,6 @@ CONSUMERS = {
     "bake for several cameras": baked(cameras=CAMERAS),
     "Hook": hook,
     "popping": popping,
-    "order_by_extinction": lambda model: [order_by_extinction(model, CAMERAS)],
 }
 
 
@@ -129,7 +128,7 @@ def agree(these, those, within):
 
 
 # Growth is no part of the culling rule.
-WITHOUT_GROWTH = {"order_by_extinction", *(name for name in CONSUMERS if "dial_for" in name)}
+WITHOUT_GROWTH = {name for name in CONSUMERS if "dial_for" in name}
 
 
 @pytest.mark.parametrize("name", CONSUMERS)

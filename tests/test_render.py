@@ -16,7 +16,7 @@ from torch.testing import assert_close
 import gsplat_versions
 import inria_forks
 from backends import fresh_copy, gsplat_arguments
-from clod_adapter import AttenuationConfig, Hook, bake, order_by_extinction, render, save
+from clod_adapter import AttenuationConfig, Hook, bake, render, save
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import attenuate, dial
@@ -175,11 +175,6 @@ def test_bad_arguments_are_refused():
         "virtual_scale is -0.5": lambda: bake(model, -0.5, camera()),
         "no Gaussian is kept at s = 200": lambda: bake(model, 200.0, camera()),
         "either camera or cameras": lambda: bake(model, 2.0),
-        "paper's form rows have no order": lambda: order_by_extinction(
-            spread(form="paper"), [camera()]
-        ),
-        "no camera is given": lambda: order_by_extinction(model, []),
-        "no pruning order": lambda: order_by_extinction(plain, [camera()]),
     }.items():
         with refused(message):
             call()

@@ -70,9 +70,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     text = "fine-tune what is baked for a dial value on the photographs of --images"
     output.add_argument("--tune", action="store_true", help=text)
     output.add_argument(
-        "--order", choices=["extinction"], help="put first the Gaussians that are culled last"
-    )
-    output.add_argument(
         "--exact",
         action="store_true",
         help="an .html page with float32 values: eight times the size",
@@ -100,14 +97,13 @@ def check(args: Namespace) -> None:
             args.multiplier != MULTIPLIER and not folder,
             f"--multiplier is for {' and '.join(FOLDERS)}; add one of them",
         ),
-        (folder and args.order, f"{folder} sorts the Gaussians itself; remove --order"),
         (
             args.camera and args.images is None,
             "--camera needs the scene of the photograph; give --images too",
         ),
         (
-            page and (args.levels or args.camera is not None or args.order),
-            f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order",
+            page and (args.levels or args.camera is not None),
+            f"a {PAGE} page contains the whole dial; remove --levels and --camera",
         ),
         (
             args.camera and not bakes,
@@ -122,9 +118,8 @@ def check(args: Namespace) -> None:
             f"--exact is for {PAGE} pages; another format has its own precision: remove it",
         ),
         (
-            args.images is not None
-            and not (bakes or args.order or page or args.sh_degree is not None),
-            f"--images is for baking, --sh-degree, --order and {PAGE} only; add one, as in --sv 2",
+            args.images is not None and not (bakes or page or args.sh_degree is not None),
+            f"--images is for baking, --sh-degree and {PAGE} only; add one, as in --sv 2",
         ),
         (
             folder and out.suffix.lower() in (".json", *FORMATS),
@@ -144,16 +139,12 @@ def check(args: Namespace) -> None:
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
     refuse(
         (
-            (bakes or folder or args.order) and not dial,
-            f"{args.model}: has no sigma_d, so no dial values, levels or order; adapt it first",
+            (bakes or folder) and not dial,
+            f"{args.model}: has no sigma_d, so no dial values or levels; adapt it first",
         ),
         (
             dial and not bakes and form and not form.carries_sigma,
             f"{out}: {suffix} cannot store a dial; bake one, as in --sv 1, or choose of {others}",
-        ),
-        (
-            args.order and form and not form.ordered,
-            f"{out}: {suffix} sorts the Gaussians itself; remove --order",
         ),
     )
     if folder == "--lod-meta" or suffix in CONVERTED:
@@ -206,14 +197,12 @@ baking:
   --keep is exact. --psnr-drop and --fps use the quality table in MODEL; with
   --images, --fps times frames of MODEL on this machine.
 
-levels and order:
+levels:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none.
   --lod-meta, and --3dtiles for CesiumJS, make OUT a new folder with a set of
   levels. The finest is the checkpoint; each other one is baked for a band of
   distances M times as far as the one before, and the last one has at least 1 %
   of the Gaussians. Viewers draw each part of a scene at the level of its band.
-  --order extinction is for renderers that draw the first n rows: for any n
-  these are the rows of --keep n. They pop where the dial fades.
 
 tuning:
   --tune takes minutes for each file. A file of one dial value gains a little,
@@ -237,5 +226,4 @@ examples:
   clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply
   clod-adapt export garden_clod.ply --images garden -o garden.html
   clod-adapt export garden_clod.ply --3dtiles -o garden_tiles
-  clod-adapt export garden_clod.ply --order extinction -o sorted.ply
 """

@@ -15,7 +15,6 @@ from clod_adapter import (
     View,
     bake,
     bake_levels,
-    order_by_extinction,
     place_cameras,
     render,
     tune,
@@ -80,7 +79,6 @@ def export(args: Namespace) -> Report:
         "base_count": total,
         "camera": camera.name if camera else None,
         "cameras": len(export.cameras),
-        "order": args.order,
         "outputs": written,
         "notes": export.console.notes,
         "seconds": watch.report(),
@@ -121,11 +119,7 @@ class Export:
         self.views = inputs.read_cameras(self.model, args.images, self.console) if reads else []
         if args.sh_degree is not None:
             self._reduce_sh_degree(args.sh_degree)
-        self.gaussians = self.model.gaussians  # sorted with --order
-        if args.order:
-            self.gaussians = self.gaussians.select(
-                order_by_extinction(self.gaussians, self.cameras)
-            )
+        self.gaussians = self.model.gaussians
         baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
         dials = args.levels or solve_dials(
             args, self.model, self.cameras, self.console, baked=baked
@@ -148,13 +142,7 @@ class Export:
         """
         args, model = self.args, self.model
         counts = given_budget(args) and not (self.page and args.psnr_drop)
-        if not (
-            args.order
-            or args.levels
-            or counts
-            or args.sh_degree is not None
-            or (args.sv and not self.page)
-        ):
+        if not (args.levels or counts or args.sh_degree is not None or (args.sv and not self.page)):
             return (), ""
         if args.images is not None:
             cameras = inputs.read_cameras(
@@ -280,8 +268,6 @@ class Export:
                 about.append("tuned for this dial value")
                 with self.console.meter(Phase.TUNING) as meter:
                     gaussians = tune(gaussians, self.tuning_views, progress=meter)
-        if self.args.order:
-            about.append("rows in the order in which the dial keeps them longest")
         return gaussians, tuple(dict.fromkeys(about))
 
     def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:

@@ -11,15 +11,14 @@ PAGE = ".html"
 # Written by splat-transform, which sorts the rows of some along a space-filling curve.
 CONVERTED = {
     ".glb": Format(about=("float32 (KHR_gaussian_splatting); by splat-transform",)),
-    ".sog": Format(about=("8 to 16 bits, SH from a palette; by splat-transform",), ordered=False),
-    ".compressed.ply": Format(about=("8 to 11 bits; by splat-transform",), ordered=False),
+    ".sog": Format(about=("8 to 16 bits, SH from a palette; by splat-transform",)),
+    ".compressed.ply": Format(about=("8 to 11 bits; by splat-transform",)),
 }
 FORMATS = {
     **WRITABLE,
     **CONVERTED,
     PAGE: Format(
         about=("the viewer with the splat, in one file;", "as .spz, or with --exact as float32"),
-        ordered=False,
         carries_sigma=True,
     ),
 }

@@ -37,7 +37,6 @@ class Format(NamedTuple):
     carries_sigma: bool = False  # whether the dial is written: sigma_d, growth_d and their settings
     # where it is written, the precision of its values; lines of at most 54 letters
     about: tuple[str, ...] = ()
-    ordered: bool = True  # whether the rows keep their order
 
 
 PACKED = ".compressed.ply"

@@ -152,10 +152,6 @@ ERRORS = [
         "export bare.ply -o x.sog",
         "x.sog: .sog cannot store a dial; bake one, .* choose of .*.ply",
     ),
-    (
-        "export bare.ply -o x.sog --sv 2 --order extinction",
-        "x.sog: .sog sorts the Gaussians itself",
-    ),
     ("export bare.ply -o x.ply --sv 2 --levels 1,2", "--levels: not allowed with argument --sv"),
     (
         "export bare.ply -o x.spz --exact",
@@ -167,7 +163,7 @@ ERRORS = [
     ),
     (
         "export base.ply -o x --lod-meta",
-        "base.ply: has no sigma_d, so no dial values, levels or order; adapt it first",
+        "base.ply: has no sigma_d, so no dial values or levels; adapt it first",
     ),
     (
         "export bare.ply -o x --lod-meta --levels 1,2",
@@ -184,7 +180,7 @@ ERRORS = [
     ("export bare.ply -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
     (
         "export bare.ply -o x.ply --images scene",
-        "--images is for baking, --sh-degree, --order and .html",
+        "--images is for baking, --sh-degree and .html",
     ),
     (
         "export bare.ply -o x.ply --sv 2 --tune",

@@ -1,4 +1,4 @@
-"""``clod-adapt export``: formats, baked files, levels, streaming sets, orders and pages."""
+"""``clod-adapt export``: formats, baked files, levels, streaming sets and pages."""
 
 import base64
 import json
@@ -16,7 +16,6 @@ from plyfile import PlyData
 from torch.testing import assert_close
 
 from clod_adapter import (
-    AdaptConfig,
     ClodError,
     bake,
     bake_levels,
@@ -24,13 +23,11 @@ from clod_adapter import (
     evaluate,
     load,
     load_scene,
-    order_by_extinction,
     place_cameras,
     render,
     save,
 )
 from clod_adapter.harmonics import with_sh_degree
-from clod_adapter.initialization.importance import initialize
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_layout import write_comments
 from clod_adapter.io.settings import Metadata
@@ -250,28 +247,6 @@ def test_losses_are_noted(clod, attenuated):
     again = load("x.ply")
     assert len(again.gaussians) == len(baked("far.ply", 2.0)) == len(baked(attenuated, 2.0))
     assert 436_000 < again.vertex["x"].mean() < 438_000
-
-
-def test_order_by_extinction(clod, capture):
-    """Of a dial without near and far Gaussians, which have no order."""
-    assert "have no order" in clod(EXPORT, "--order extinction -o x.ply", code=2).err
-    scene = load_scene(capture.scene)
-    save("dial.ply", initialize(capture.gaussians, scene.train, AdaptConfig(max_sv=4.0)))
-    model = load("dial.ply").gaussians
-    words = "export dial.ply --images SCENE --json --order extinction"
-    cameras = [view.camera for view in scene.train]
-    rows = order_by_extinction(model, cameras)
-    report = clod(words, "-o ordered.ply").report
-    ordered = load("ordered.ply")
-    assert report["order"] == "extinction" and ordered.gaussians == model[rows]
-    assert any("rows in the order" in comment for comment in ordered.comments)
-    n = len(bake(model, 3.0, cameras=cameras))
-    clod(words, "-o first.ply --keep", n)
-    assert n < 300 and torch.equal(load("first.ply").gaussians.means, model.means[rows[:n]])
-    clod(words, "--camera 003 --sv 2 -o one.ply")
-    camera = camera_003(cameras)
-    ordered = model[order_by_extinction(model, [camera])]
-    assert load("one.ply").gaussians == bake(ordered, 2.0, camera)
 
 
 def test_splat_transform(clod, attenuated, tmp_path, tool):

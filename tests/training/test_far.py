@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
-from refusals import refused
 from torch.nn.functional import pad
 
 import clod_adapter as clod
 from clod_adapter import adapt, detach, make_plan, render
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.bake import bake, order_by_extinction
+from clod_adapter.bake import bake
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.evaluation.budget import dial_for
@@ -138,8 +137,6 @@ def test_counts_and_baking(adapted, both):
     camera = cameras[0]
     baked = render(bake(adapted, 1.7, camera), camera).image
     assert torch.allclose(baked, render(adapted, camera, 1.7).image, atol=1e-3)
-    with refused("have no order"):
-        order_by_extinction(adapted, cameras)
 
 
 def test_a_second_run_continues_with_the_far_ones(adapted, both):
