@@ -78,9 +78,8 @@ def main():
         append(FILE, {"scene": scene, **row}, args.record)
         for row in of_dial(base, out, views):
             append(FILE, {"scene": scene, **row}, args.record)
-        adapted = clod.load(out)
-        sets = sets_of(args.scene, args.author, adapted.gaussians, folder)
-        for row in (*of_plain(adapted, sets, views, len(base)), *of_sets(base, sets, views)):
+        sets = sets_of(args.scene, args.author, clod.load(out).gaussians, folder)
+        for row in (*of_plain(out, sets, views, len(base)), *of_sets(base, sets, views)):
             append(FILE, {"scene": scene, **row}, args.record)
 
 
@@ -111,16 +110,16 @@ def sets_of(scene, author, adapted, folder):
 
 def of_plain(adapted, sets, views, whole):
     """Plain files of the same counts, drawn everywhere: ``export --keep``, and the merged ones."""
-    places = adapted.viewpoints
     for name in SETS:
         for merged in sets[name][MULTIPLIERS[0]][1:]:
             share = len(merged) / whole
             yield {"method": f"{name}, plain", **measured(Plain(merged), views, share, whole)}
+    plain = adapted.with_name("plain.ply")
     for merged in sets["halved"][MULTIPLIERS[0]][1:]:
+        clod_adapt("export", adapted, "--keep", len(merged), "--quiet", "--out", plain)
+        gaussians = clod.load(plain).gaussians
         share = len(merged) / whole
-        dial = clod.dial_for(adapted.gaussians, keep=len(merged), cameras=places, baked=True)
-        baked = clod.bake(adapted.gaussians, dial.virtual_scale, cameras=places)
-        yield {"method": "plain", **measured(Plain(baked), views, share, whole)}
+        yield {"method": "plain", **measured(Plain(gaussians), views, share, whole)}
 
 
 def of_sets(base, sets, views):

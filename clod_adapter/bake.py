@@ -88,7 +88,7 @@ def bake(
     if camera or virtual_scale <= trained:
         return _plain(gaussians, kept, shown, grown)
     smallest = bake(gaussians, trained, cameras=cameras)
-    return merge(smallest, torch.ones(len(smallest)), int(kept.keep.sum()))
+    return merge(smallest, int(kept.keep.sum()))
 
 
 class Level(NamedTuple):

@@ -4,7 +4,6 @@ from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
 from tempfile import TemporaryDirectory
 
 from clod_adapter import (
@@ -15,20 +14,21 @@ from clod_adapter import (
     View,
     bake,
     bake_levels,
+    detach,
     place_cameras,
-    render,
     tune,
 )
 from clod_adapter.bake import Level
 from clod_adapter.cameras import spread
+from clod_adapter.evaluation.agreement import agreement
 from clod_adapter.harmonics import with_sh_degree
+from clod_adapter.initialization.merging import merge
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.io.settings import Metadata
-from clod_adapter.losses import psnr
 from clod_adapter.quality_table import Viewpoint
 from clod_adapter.viewer.page import write_viewer_page
 
@@ -176,16 +176,15 @@ class Export:
     def _reduce_sh_degree(self, wanted: str) -> None:
         """Replaces the model's Gaussians, with a note on what that changes."""
         before = self.model.gaussians
-        inputs.prepare_kernels(self.console, before.means.device, training=False)
         for degree in range(before.sh_degree):
             if wanted not in ("auto", str(degree)):
                 continue
             after = with_sh_degree(before, degree, self.cameras)
-            agreement = self._agreement(after, before)
-            if wanted == "auto" and agreement < AGREE:
+            alike = agreement(after, before, self._compared())
+            if wanted == "auto" and alike < AGREE:
                 continue
             self.console.note(
-                f"SH degree {degree}: renders have a PSNR of {agreement:.1f} dB against those with"
+                f"SH degree {degree}: renders have a PSNR of {alike:.1f} dB against those with"
                 f" degree {before.sh_degree} (fitted to {self.about})"
             )
             self.model = replace(self.model, gaussians=after, vertex=None)
@@ -194,15 +193,12 @@ class Export:
             f"--sh-degree {wanted}: the file has SH degree {before.sh_degree}, and stays as it is"
         )
 
-    def _agreement(self, shown: Gaussians, exact: Gaussians) -> float:
-        """PSNR in dB of renders of the first against those of the second, in the mean over COMPARED
-        views.
-        """
+    def _compared(self) -> Sequence[Camera]:
+        """Views on which two versions of the model are compared."""
+        inputs.prepare_kernels(self.console, self.model.gaussians.means.device, training=False)
         known = self.views or [camera for camera in self.cameras if isinstance(camera, Camera)]
-        views = spread(
-            known or self.model.cameras or place_cameras(exact, views=COMPARED), COMPARED
-        )
-        return fmean(psnr(render(shown, each).image, render(exact, each).pixels) for each in views)
+        known = known or self.model.cameras
+        return spread(known or place_cameras(self.model.gaussians, views=COMPARED), COMPARED)
 
     def note_losses(self) -> None:
         """Notes dropped columns, and a screen-space filter that most readers do not find."""
@@ -261,14 +257,35 @@ class Export:
                     " there only"
                 )
             about.append(f"baked at s = {virtual_scale:.6g} by clod-adapter for {cameras}")
-            gaussians = bake(
-                gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras
-            )
+            gaussians = self._baked(virtual_scale)
             if self.args.tune:
                 about.append("tuned for this dial value")
                 with self.console.meter(Phase.TUNING) as meter:
                     gaussians = tune(gaussians, self.tuning_views, progress=meter)
         return gaussians, tuple(dict.fromkeys(about))
+
+    def _baked(self, virtual_scale: float) -> Gaussians:
+        """What one dial value keeps; or, for several cameras without photographs, the checkpoint
+        merged to as many, if its renders are nearer to the checkpoint's.
+        """
+        table = self.model.quality_table
+        baked = bake(
+            self.gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras
+        )
+        if self.camera or not table or table.against == "photographs":
+            return baked
+        checkpoint = detach(self.gaussians)
+        merged = merge(checkpoint, len(baked))
+        inputs.prepare_kernels(self.console, checkpoint.means.device, training=False)
+        with self.console.meter("placing cameras") as meter:  # none of those that it is baked for
+            views = place_cameras(checkpoint, views=PLACED, seed=1, progress=meter)
+        if agreement(merged, checkpoint, views) <= agreement(baked, checkpoint, views):
+            return baked
+        self.console.note(
+            "written is the checkpoint merged to that number: it is nearer to the checkpoint's"
+            " renders than what the dial keeps for all cameras"
+        )
+        return merged
 
     def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:
         """Writes a file, with notes on losses of the format; returns its number of Gaussians."""
@@ -312,7 +329,6 @@ class Export:
 
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Writes a page, and notes the PSNR of its renders against those of the exact Gaussians."""
-        inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
         shown, losses = write_viewer_page(
             path,
             self.model,
@@ -325,9 +341,9 @@ class Export:
         if self.args.exact:
             return
         with self.console.status("comparing with the exact values ..."):
-            agreement = self._agreement(shown, self.gaussians)
+            alike = agreement(shown, self.gaussians, self._compared())
         self.console.note(
-            f"renders of the page have a PSNR of {agreement:.1f} dB against the exact file (s = 1);"
+            f"renders of the page have a PSNR of {alike:.1f} dB against the exact file (s = 1);"
             " --exact keeps all digits",
             of=str(self.model.path),
         )

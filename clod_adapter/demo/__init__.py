@@ -77,7 +77,8 @@ def draw(
 
 def merging(base: Gaussians, scene: Scene) -> Callable[[int], Gaussians]:
     """Merges the base to a count, by importance for the photographs, without training."""
-    return partial(merge, base, importance(base, spread(scene.train, MOST_VIEWS), AdaptConfig()))
+    weights = importance(base, spread(scene.train, MOST_VIEWS), AdaptConfig())
+    return partial(merge, base, importance=weights)
 
 
 @torch.no_grad()

@@ -5,7 +5,7 @@ A group of Gaussians with masses ``m = opacity area`` becomes one with their tot
 ``mu`` weighted by mass, the covariance ``mean of (C_i + (mu_i - mu)(mu_i - mu)^T)``, and the mean
 of their harmonics. Its opacity is the mass over its own area, at most OPAQUEST. The two whose
 merging changes least are merged first: by the change of shape and colour times
-``sqrt(w_i w_j / (w_i + w_j))``, with w their importance.
+``sqrt(w_i w_j / (w_i + w_j))``, with w their importance, which is 1 where none is given.
 
 After Gaussian mixture reduction (Runnalls, "Kullback-Leibler approach to Gaussian mixture
 reduction", 2007), with the area of an ellipsoid (Thomsen's formula) as splat-transform weighs.
@@ -29,6 +29,9 @@ from clod_adapter.progress import Listener, Phase, tell
 NEIGHBOURS = 12  # of each Gaussian, with which it may be merged in a round
 COLOUR = 2.0  # weight of the squared difference of harmonics
 ROUND = 0.25  # of the remaining that one round removes at most
+# the same where all matter alike: nearly all are merged once before one is merged again, which
+# keeps what is small beside what is large
+ROUND_ALIKE = 0.5
 LEAST = 1e-3  # of a cost, and share of the mean importance: below, differences do not matter
 OPAQUEST = 0.999
 THINNEST = 1e-8  # added to variances, world units^2
@@ -66,8 +69,8 @@ class Mixture:
 @np.errstate(under="ignore")
 def merge(
     gaussians: Gaussians,
-    importance: Tensor,
     count: int,
+    importance: Tensor | None = None,
     progress: Listener | None = None,
 ) -> Gaussians:
     """About ``count`` Gaussians, without a dial, that stand for all of them; themselves if there
@@ -75,21 +78,22 @@ def merge(
 
     Args:
         importance: ``[N]``, at least 0, how much a Gaussian matters to the pictures; merged ones
-            have the sum. Without it, what nobody sees would get as many of the merged ones as what
-            everybody sees, which costs 0.5 dB.
+            have the sum. Without it all matter alike, what nobody sees too: right for one plain
+            file, which nothing trains.
     """
     mixture = mixture_of(gaussians)
     before = len(gaussians)
-    weights = float64_array(importance)
+    share = ROUND_ALIKE if importance is None else ROUND
+    weights = np.ones(before) if importance is None else float64_array(importance)
     # of what no view shows, the most similar are merged first
     weights = weights + LEAST * weights.mean()
     while len(mixture) > count:
-        least = int((1 - ROUND) * len(mixture))
+        least = int((1 - share) * len(mixture))
         groups = _groups(mixture, weights, max(count, least))
         if groups.max() + 1 == len(mixture):
             break
         mixture = mixture.merged(groups)
-        weights = np.bincount(groups, weights)
+        weights = np.ones(len(mixture)) if importance is None else np.bincount(groups, weights)
         tell(progress, Phase.MERGING, before - len(mixture), before - count)
     return gaussians_of(mixture, gaussians)
 

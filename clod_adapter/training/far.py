@@ -91,7 +91,7 @@ def with_far(
     if placed:  # such cameras do not show everything
         error = supposed_error(base, error)
     weights = (error.sqrt() * base.opacities).double() ** contrast
-    far = merge(base, weights, max(round(share * len(base)), 1), progress)
+    far = merge(base, max(round(share * len(base)), 1), weights, progress)
     order = pruning_order(far, importance(far, views, config, progress), progress)
     distances = typical_distance(far.means, cameras, attenuation)
     reach = reach_of(order, distances, replace(config, start_share=1.0), len(base))

@@ -27,6 +27,7 @@ from clod_adapter import (
     render,
     save,
 )
+from clod_adapter.evaluation.agreement import agreement
 from clod_adapter.harmonics import with_sh_degree
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_layout import write_comments
@@ -247,6 +248,28 @@ def test_losses_are_noted(clod, attenuated):
     again = load("x.ply")
     assert len(again.gaussians) == len(baked("far.ply", 2.0)) == len(baked(attenuated, 2.0))
     assert 436_000 < again.vertex["x"].mean() < 438_000
+
+
+@pytest.mark.parametrize("against", ["photographs", "checkpoint"])
+def test_without_photographs_merged_where_that_is_nearer(clod, attenuated, against):
+    """Far Gaussians of another colour are worse than the checkpoint, merged."""
+    model = load(attenuated)
+    wrong = (~model.gaussians.near).float()[:, None, None]
+    table = replace(model.quality_table, against=against)
+    harmed = model.gaussians.replace(sh0=model.gaussians.sh0 + 3 * wrong)
+    save("harmed.ply", harmed, quality_table=table)
+    done = clod("export harmed.ply --keep 100 -o x.ply --json")
+    of_dial = baked("harmed.ply", done.output["virtual_scale"])
+    written = load("x.ply").gaussians
+    if against == "photographs":
+        assert done.report["notes"][1:] == [] and written == of_dial
+        return
+    assert done.note("written is the checkpoint merged") and len(written) == len(of_dial)
+    exact = detach(harmed)
+    near, nearer = (agreement(each, exact, model.cameras) for each in (of_dial, written))
+    assert nearer > near
+    clod("export harmed.ply --sv 0 -o x.ply")
+    assert load("x.ply").gaussians == exact
 
 
 def test_splat_transform(clod, attenuated, tmp_path, tool):

@@ -1,0 +1,22 @@
+"""How alike two sets of Gaussians look."""
+
+from collections.abc import Sequence
+from statistics import fmean
+
+from clod_adapter.cameras import Camera
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.losses import decibels, mean_squared_error
+from clod_adapter.render import render
+
+
+def agreement(shown: Gaussians, exact: Gaussians, cameras: Sequence[Camera]) -> float:
+    """PSNR in dB of renders of ``shown`` against those of ``exact``, at s = 1 of a dial.
+
+    It is that of the mean squared error over all cameras: one that looks wrong counts for much.
+    """
+    return decibels(
+        fmean(
+            mean_squared_error(render(shown, each).image, render(exact, each).pixels)
+            for each in cameras
+        )
+    )
