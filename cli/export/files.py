@@ -43,12 +43,12 @@ PLACED = 16  # cameras placed where none are known
 # by the option of a set, what to set in its viewer: printed after it is written
 SETTINGS = {
     "--lod-meta": (
-        "in PlayCanvas: lodBaseDistance = {begins:.4g}, lodMultiplier = {multiplier:g},"
+        "in PlayCanvas: lodBaseDistance = {:.4g}, lodMultiplier = {:g},"
         " minPixelSize = 0, as it else leaves out what is small, and a splatBudget below the finest"
         " level's number; within the budget it draws that level everywhere"
     ),
     "--3dtiles": (
-        "in CesiumJS with maximumScreenSpaceError = 16, its default, level 1 begins at {begins:.4g}"
+        "in CesiumJS with maximumScreenSpaceError = 16, its default, level 1 begins at {:.4g}"
         " on a screen of 1,080 lines"
     ),
 }
@@ -63,16 +63,12 @@ def export(args: Namespace) -> Report:
     for output in written:
         print(line_of(output, total))
         if args.folder and len(output["levels"]) > 1:
-            print(
-                SETTINGS[args.folder].format(
-                    begins=output["levels"][1]["begins"], multiplier=args.multiplier
-                )
-            )
+            print(SETTINGS[args.folder].format(output["levels"][1]["begins"], args.multiplier))
     if export.dials and not export.page:
-        baked = (
-            f"exact at the camera of {camera.name} only" if camera else f"baked for {export.about}"
+        print(
+            f"baked for {export.about}; lossy: without the dial and the Gaussians culled at this"
+            " dial value"
         )
-        print(f"{baked}; lossy: without the dial and the Gaussians culled at this dial value")
     return {
         "model": args.model,
         "files": [args.model, *args.others],
@@ -157,7 +153,7 @@ class Export:
                     " the full name"
                 )
             self.camera = found[0]
-            return found, "one camera"
+            return found, f"the camera of {found[0].name} only, exact there"
         if model.viewpoints:
             return model.viewpoints, f"{len(model.viewpoints)} training cameras"
         try:
@@ -196,7 +192,7 @@ class Export:
     def _compared(self) -> Sequence[Camera]:
         """Views on which two versions of the model are compared."""
         inputs.prepare_kernels(self.console, self.model.gaussians.means.device, training=False)
-        known = self.views or [camera for camera in self.cameras if isinstance(camera, Camera)]
+        known = self.views or [each for each in self.cameras if isinstance(each, Camera)]
         known = known or self.model.cameras
         return spread(known or place_cameras(self.model.gaussians, views=COMPARED), COMPARED)
 
@@ -207,9 +203,9 @@ class Export:
             if dropped := extra_columns(names, model.gaussians.sh_degree):
                 self.console.note(f"columns dropped: {', '.join(dropped)}")
         screen_filter = self.gaussians.screen_filter
-        has_dial = self.gaussians.sigma_d is not None and not self.dials
-        stored = not self.args.folder and suffix_of(Path(self.args.out)) in STORE_FILTER
-        if screen_filter.compensate and not has_dial and not stored:
+        plain = self.gaussians.sigma_d is None or self.dials
+        lost = self.args.folder or suffix_of(Path(self.args.out)) not in STORE_FILTER
+        if screen_filter.compensate and plain and lost:
             self.console.note(
                 f"trained antialiased ({screen_filter.description}): most readers need an option"
                 ' for it: antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
@@ -275,7 +271,8 @@ class Export:
         if self.camera or not table or table.against == "photographs":
             return baked
         checkpoint = detach(self.gaussians)
-        merged = merge(checkpoint, len(baked))
+        with self.console.meter(Phase.MERGING) as meter:
+            merged = merge(checkpoint, len(baked), progress=meter)
         inputs.prepare_kernels(self.console, checkpoint.means.device, training=False)
         with self.console.meter("placing cameras") as meter:  # none of those that it is baked for
             views = place_cameras(checkpoint, views=PLACED, seed=1, progress=meter)
