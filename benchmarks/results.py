@@ -56,7 +56,6 @@ TABLES: dict[str, Callable[[], Table]] = {
     "robustness": robustness.page_table,
     "scaling": scaling.page_table,
     "scaling-memory": scaling.memory_table,
-    "stream": stream.plain_table,
     "tradeoff": tradeoff.page_table,
     "walk": walk.page_table,
 }
@@ -67,6 +66,8 @@ for module, parts in (
 ):
     for part in parts:
         TABLES[f"{module.__name__}-{part}"] = partial(module.page_table, part)
+for part in stream.PLAIN:
+    TABLES[f"plain-{part}"] = partial(stream.plain_table, part)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,6 @@ import json
 import math
 import tempfile
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,9 +48,9 @@ SCENES = {  # of the tables
     "plush_half": "a plush toy, 120,000, photographs",
     "bonsai146": "a table in a room, 150,000, photographs",
 }
+PLAIN = ("playbot", "taebak4", "garden2")  # of the tables of plain files
 SHOWN = {
     "dial": "this dial, one file",
-    "dial, all alike": "the same, all directions alike",
     "lod-meta": "this file's levels, `export --lod-meta`",
     "halved": "halved uniformly",
     "halved adaptively": "halved adaptively",
@@ -302,18 +301,19 @@ def page_table(scene):
     return Table(heads, with_best(lines, ".1f"), rows)
 
 
-def plain_table():
-    """Plain files of all scenes."""
-    found = last(FILE, "scene", "method", "level")
+def plain_table(scene):
+    """Plain files, drawn as they are."""
+    found = last(FILE, "method", "level", scene=scene)
     shares = [f"{1 / 2**k:.0%}" for k in range(1, HALVED + 1)]
-    ways = {"plain": "exported", **{f"{name}, plain": name for name in SETS}}
-    rows, lines = [], []
-    for scene, (method, label) in product(SCENES, ways.items()):
-        line = [found.get((scene, method, share)) for share in shares]
-        if any(line):
-            rows += line
-            lines.append([f"{scene}, {label}", *(f"{row['psnr']:.1f}" for row in line)])
-    return Table(["", *shares], lines, rows)
+    ways = {"plain": "`export --keep`"}
+    for name in SETS:
+        ways[f"{name}, plain"] = SHOWN[name]
+    rows, lines = [], {}
+    for method, label in ways.items():
+        line = [found[method, share] for share in shares]
+        rows += line
+        lines[label] = [row["psnr"] for row in line]
+    return Table([f"`{scene}`, plain files", *shares], with_best(lines, ".1f"), rows)
 
 
 if __name__ == "__main__":
