@@ -1,6 +1,4 @@
-"""Rendering with and without a dial, baking, the order by extinction; calls that would draw or
-store something else.
-"""
+"""Rendering with and without a dial, baking; calls that would draw or store something else."""
 
 import math
 import re

@@ -86,7 +86,7 @@ def check(args: Namespace) -> None:
             f"{len(args.others) + 1} models are for an {PAGE} page; export one at a time",
         ),
         (
-            args.others and args.sh_degree is not None,
+            args.others and args.sh_degree,
             "--sh-degree is for one model; export each with it before the page",
         ),
         (
@@ -118,7 +118,7 @@ def check(args: Namespace) -> None:
             f"--exact is for {PAGE} pages; another format has its own precision: remove it",
         ),
         (
-            args.images is not None and not (bakes or page or args.sh_degree is not None),
+            args.images is not None and not (bakes or page or args.sh_degree),
             f"--images is for baking, --sh-degree and {PAGE} only; add one, as in --sv 2",
         ),
         (
@@ -194,6 +194,8 @@ baking:
   grown scales. This is lossy; keep MODEL. Baking takes each Gaussian's mean
   distance to the training cameras of --images, else to those stored in MODEL,
   else to 16 placed ones. With --camera the file is exact at that camera.
+  Where MODEL was adapted without photographs, and no --images is given, the
+  checkpoint is merged to as many too, and written if it looks more like itself.
   --keep is exact. --psnr-drop and --fps use the quality table in MODEL; with
   --images, --fps times frames of MODEL on this machine.
 

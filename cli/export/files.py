@@ -3,6 +3,7 @@
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,9 +21,8 @@ from clod_adapter import (
 )
 from clod_adapter.bake import Level
 from clod_adapter.cameras import spread
-from clod_adapter.evaluation.agreement import agreement
+from clod_adapter.evaluation.agreement import agreement, merged_if_nearer
 from clod_adapter.harmonics import with_sh_degree
-from clod_adapter.initialization.merging import merge
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import write
@@ -65,10 +65,7 @@ def export(args: Namespace) -> Report:
         if args.folder and len(output["levels"]) > 1:
             print(SETTINGS[args.folder].format(output["levels"][1]["begins"], args.multiplier))
     if export.dials and not export.page:
-        print(
-            f"baked for {export.about}; lossy: without the dial and the Gaussians culled at this"
-            " dial value"
-        )
+        print(f"baked for {export.about}; lossy: without the dial and what it culls here")
     return {
         "model": args.model,
         "files": [args.model, *args.others],
@@ -108,12 +105,11 @@ class Export:
             inputs.read_model(args, path, self.console, self.model.origin, device)
             for path in args.others
         ]
-        # cameras to bake or fit for, none where that is not asked for, and what they are: in
-        # printable ASCII, as it becomes a comment of the file
+        # cameras to bake or fit for, none where that is not asked for, and what they are
         self.cameras, self.about = self._find_cameras()
         reads = self.page and args.images is not None  # cameras of the scene, for a page
         self.views = inputs.read_cameras(self.model, args.images, self.console) if reads else []
-        if args.sh_degree is not None:
+        if args.sh_degree:
             self._reduce_sh_degree(args.sh_degree)
         self.gaussians = self.model.gaussians
         baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
@@ -138,7 +134,7 @@ class Export:
         """
         args, model = self.args, self.model
         counts = given_budget(args) and not (self.page and args.psnr_drop)
-        if not (args.levels or counts or args.sh_degree is not None or (args.sv and not self.page)):
+        if not (args.levels or counts or args.sh_degree or (args.sv and not self.page)):
             return (), ""
         if args.images is not None:
             cameras = inputs.read_cameras(
@@ -153,7 +149,7 @@ class Export:
                     " the full name"
                 )
             self.camera = found[0]
-            return found, f"the camera of {found[0].name} only, exact there"
+            return found, f"the camera of {found[0].name} only"
         if model.viewpoints:
             return model.viewpoints, f"{len(model.viewpoints)} training cameras"
         try:
@@ -192,8 +188,8 @@ class Export:
     def _compared(self) -> Sequence[Camera]:
         """Views on which two versions of the model are compared."""
         inputs.prepare_kernels(self.console, self.model.gaussians.means.device, training=False)
-        known = self.views or [each for each in self.cameras if isinstance(each, Camera)]
-        known = known or self.model.cameras
+        given = [each for each in self.cameras if isinstance(each, Camera)]
+        known = self.views or given or self.model.cameras
         return spread(known or place_cameras(self.model.gaussians, views=COMPARED), COMPARED)
 
     def note_losses(self) -> None:
@@ -252,37 +248,41 @@ class Export:
                     f"the camera at ({', '.join(f'{x + by:.9g}' for x, by in place)}): exact from"
                     " there only"
                 )
-            about.append(f"baked at s = {virtual_scale:.6g} by clod-adapter for {cameras}")
-            gaussians = self._baked(virtual_scale)
+            baked = bake(
+                gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras
+            )
+            merged = self._merged(baked)
+            how = "the checkpoint merged to as many as are kept" if merged else "baked"
+            about.append(f"{how} at s = {virtual_scale:.6g} by clod-adapter for {cameras}")
+            gaussians = merged or baked
             if self.args.tune:
                 about.append("tuned for this dial value")
                 with self.console.meter(Phase.TUNING) as meter:
                     gaussians = tune(gaussians, self.tuning_views, progress=meter)
         return gaussians, tuple(dict.fromkeys(about))
 
-    def _baked(self, virtual_scale: float) -> Gaussians:
-        """What one dial value keeps; or, for several cameras without photographs, the checkpoint
-        merged to as many, if its renders are nearer to the checkpoint's.
+    def _merged(self, baked: Gaussians) -> Gaussians | None:
+        """The checkpoint merged to as many; None where there are photographs, and where the
+        checkpoint's renders are nearer to those of what is ``baked``.
         """
-        table = self.model.quality_table
-        baked = bake(
-            self.gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras
-        )
-        if self.camera or not table or table.against == "photographs":
-            return baked
-        checkpoint = detach(self.gaussians)
+        if self.args.images or not self.model.placed or len(baked) == self.gaussians.whole:
+            return None
+        views = self._unseen
         with self.console.meter(Phase.MERGING) as meter:
-            merged = merge(checkpoint, len(baked), progress=meter)
-        inputs.prepare_kernels(self.console, checkpoint.means.device, training=False)
-        with self.console.meter("placing cameras") as meter:  # none of those that it is baked for
-            views = place_cameras(checkpoint, views=PLACED, seed=1, progress=meter)
-        if agreement(merged, checkpoint, views) <= agreement(baked, checkpoint, views):
-            return baked
-        self.console.note(
-            "written is the checkpoint merged to that number: it is nearer to the checkpoint's"
-            " renders than what the dial keeps for all cameras"
-        )
+            merged = merged_if_nearer(baked, detach(self.gaussians), views, meter)
+        if merged:
+            self.console.note(
+                f"{len(merged):,} Gaussians are the checkpoint's, merged: their renders are nearer"
+                " to its own than those of what the dial keeps"
+            )
         return merged
+
+    @cached_property
+    def _unseen(self) -> Sequence[Camera]:
+        """Views other than those that the dial was trained on."""
+        inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
+        with self.console.meter("placing cameras") as meter:
+            return place_cameras(self.gaussians, views=PLACED, seed=1, progress=meter)
 
     def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:
         """Writes a file, with notes on losses of the format; returns its number of Gaussians."""
@@ -326,6 +326,7 @@ class Export:
 
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Writes a page, and notes the PSNR of its renders against those of the exact Gaussians."""
+        views = self._compared()
         shown, losses = write_viewer_page(
             path,
             self.model,
@@ -338,7 +339,7 @@ class Export:
         if self.args.exact:
             return
         with self.console.status("comparing with the exact values ..."):
-            alike = agreement(shown, self.gaussians, self._compared())
+            alike = agreement(shown, self.gaussians, views)
         self.console.note(
             f"renders of the page have a PSNR of {alike:.1f} dB against the exact file (s = 1);"
             " --exact keeps all digits",

@@ -8,7 +8,7 @@ from clod_adapter import ClodError
 from clod_adapter.io.file_formats import WRITABLE, Format
 
 PAGE = ".html"
-# Written by splat-transform, which sorts the rows of some along a space-filling curve.
+# written by splat-transform
 CONVERTED = {
     ".glb": Format(about=("float32 (KHR_gaussian_splatting); by splat-transform",)),
     ".sog": Format(about=("8 to 16 bits, SH from a palette; by splat-transform",)),

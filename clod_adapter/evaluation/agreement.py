@@ -5,7 +5,9 @@ from statistics import fmean
 
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.merging import merge
 from clod_adapter.losses import decibels, mean_squared_error
+from clod_adapter.progress import Listener
 from clod_adapter.render import render
 
 
@@ -20,3 +22,17 @@ def agreement(shown: Gaussians, exact: Gaussians, cameras: Sequence[Camera]) -> 
             for each in cameras
         )
     )
+
+
+def merged_if_nearer(
+    baked: Gaussians,
+    checkpoint: Gaussians,
+    cameras: Sequence[Camera],
+    progress: Listener | None = None,
+) -> Gaussians | None:
+    """The checkpoint merged to as many as are ``baked``, if its ``agreement`` with the checkpoint
+    is the larger one.
+    """
+    merged = merge(checkpoint, len(baked), progress=progress)
+    nearer = agreement(merged, checkpoint, cameras) > agreement(baked, checkpoint, cameras)
+    return merged if nearer else None

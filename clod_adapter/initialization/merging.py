@@ -73,8 +73,8 @@ def merge(
     importance: Tensor | None = None,
     progress: Listener | None = None,
 ) -> Gaussians:
-    """About ``count`` Gaussians, without a dial, that stand for all of them; themselves if there
-    are no more.
+    """About ``count`` Gaussians, without a dial, that stand for all of them; themselves, but for
+    rounding, if there are no more.
 
     Args:
         importance: ``[N]``, at least 0, how much a Gaussian matters to the pictures; merged ones
