@@ -123,14 +123,8 @@ def curves(scene, k):
     points = {method: [] for method in LABELS}
     for (method, _), row in sorted(runs.items()):
         point = row["rows"][k]
-        points[method].append(
-            {"seconds": row["seconds"][k], "psnr": point["psnr"], "share": point["kept_share"]}
-        )
-    return [
-        {"label": f"{LABELS[method]} ({line[-1]['share']:.0%} kept)", "points": line}
-        for method, line in points.items()
-        if line
-    ]
+        points[method].append({"seconds": row["seconds"][k], "psnr": point["psnr"]})
+    return [{"label": LABELS[method], "points": line} for method, line in points.items() if line]
 
 
 def page_table():
@@ -154,6 +148,10 @@ def plot(scene):
         for k, (axes, s) in enumerate(zip(figure.subplots(1, len(DIALS)), DIALS, strict=True)):
             draw_training(axes, curves(scene, k), base["psnr"])
             axes.set_title(f"s = {s:g}", loc="left", fontsize=10, weight="bold")
+            axes.get_legend().remove()
+        # one legend for all panels
+        named = axes.get_legend_handles_labels()
+        figure.legend(*named, loc="outside lower center", ncols=len(LABELS) + 1)
         save_figure(figure, PICTURE)
     print(PICTURE)
 
