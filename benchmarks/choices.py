@@ -69,7 +69,7 @@ SHOWN = {  # in the table
 SHOWN_PLACED = {  # without photographs
     ("default", None): "default",
     ("PLACED_SHARE", 0.8): "0.8 times as many far ones, not 0.4",
-    ("PLACED_NEARER", 0.2): "from the 20th percentile of the distances on, not the 60th",
+    ("PLACED_NEARER", 0.2): "from the 20th percentile on, not the 60th",
     ("PLACED_NEARER", 0.5): "from the median on",
     ("PLACED_CONTRAST", 1.0): "importance itself, not its cube",
     ("exponent", 1.5): "counts `s^-1.5`, not `s^-1.75`",
