@@ -168,11 +168,12 @@ class Export:
     def _reduce_sh_degree(self, wanted: str) -> None:
         """Replaces the model's Gaussians, with a note on what that changes."""
         before = self.model.gaussians
+        self._prepare()
         for degree in range(before.sh_degree):
             if wanted not in ("auto", str(degree)):
                 continue
             after = with_sh_degree(before, degree, self.cameras)
-            alike = agreement(after, before, self._compared())
+            alike = agreement(after, before, self._compared)
             if wanted == "auto" and alike < AGREE:
                 continue
             self.console.note(
@@ -185,9 +186,13 @@ class Export:
             f"--sh-degree {wanted}: the file has SH degree {before.sh_degree}, and stays as it is"
         )
 
+    def _prepare(self) -> None:
+        """Compiles what renders need."""
+        inputs.prepare_kernels(self.console, self.model.gaussians.means.device, training=False)
+
+    @cached_property
     def _compared(self) -> Sequence[Camera]:
         """Views on which two versions of the model are compared."""
-        inputs.prepare_kernels(self.console, self.model.gaussians.means.device, training=False)
         given = [each for each in self.cameras if isinstance(each, Camera)]
         known = self.views or given or self.model.cameras
         return spread(known or place_cameras(self.model.gaussians, views=COMPARED), COMPARED)
@@ -280,7 +285,7 @@ class Export:
     @cached_property
     def _unseen(self) -> Sequence[Camera]:
         """Views other than those that the dial was trained on."""
-        inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
+        self._prepare()
         with self.console.meter("placing cameras") as meter:
             return place_cameras(self.gaussians, views=PLACED, seed=1, progress=meter)
 
@@ -326,7 +331,7 @@ class Export:
 
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Writes a page, and notes the PSNR of its renders against those of the exact Gaussians."""
-        views = self._compared()
+        self._prepare()
         shown, losses = write_viewer_page(
             path,
             self.model,
@@ -339,7 +344,7 @@ class Export:
         if self.args.exact:
             return
         with self.console.status("comparing with the exact values ..."):
-            alike = agreement(shown, self.gaussians, views)
+            alike = agreement(shown, self.gaussians, self._compared)
         self.console.note(
             f"renders of the page have a PSNR of {alike:.1f} dB against the exact file (s = 1);"
             " --exact keeps all digits",
