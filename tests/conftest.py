@@ -43,6 +43,7 @@ pseudo_views.MANY = 8  # the tests' captures have eight, which are few by the me
 def pytest_sessionstart(session):
     """Compiles the kernels; of several test processes the first does, and the others load them."""
     if run := getattr(session.config, "workerinput", {}).get("testrunuid"):
+        torch.set_num_threads(1)  # the processes share the cores; tests of threads set their number
         with FileLock(Path(tempfile.gettempdir()) / f"clod-{run}.lock"):
             for screen_filter in (FILTERS["off"], FILTERS["on"]):
                 prepare_kernels(Console(quiet=True), screen_filter=screen_filter)
