@@ -19,6 +19,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 SOFTWARE = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",  # WebGL
+    "--disable-gpu-compositing",  # of the page around it, which a software GPU slows down
     # WebGPU
     "--enable-unsafe-webgpu",
     "--use-webgpu-adapter=swiftshader",
