@@ -284,6 +284,8 @@ def test_splat_transform(clod, attenuated, tmp_path, tool):
     assert said["words"][:5] == ["-w", "-g", "cpu", "-i", "1"]
     assert said["words"][-1].endswith("packed.sog")
     assert said["sizes"][0] > 92 * done.output["count"]
+    done = clod("export BASE --antialiasing on --json -o x.sog")
+    assert done.note("trained antialiased") in done.err
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
     (tmp_path / "-o").mkdir()  # empty; not an option of the tool
     done = clod(EXPORT, "--lod-meta --out=-o")
@@ -364,11 +366,11 @@ def test_gltf_of_the_real_tool(clod, attenuated):
 
 @pytest.mark.usefixtures("real_tool")
 def test_a_set_of_the_real_tool(clod, attenuated, tmp_path):
-    clod("export DIAL --lod-meta --multiplier 2 -o out")
+    clod("export DIAL --lod-meta --multiplier 4 -o out")
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
-    levels = bake_levels(load(attenuated).gaussians, 2.0)
+    levels = bake_levels(load(attenuated).gaussians, 4.0)
     assert meta["counts"] == [len(level.gaussians) for level in levels]
-    assert meta["lodLevels"] == len(levels)
+    assert meta["lodLevels"] == len(levels) > 2
     assert all((tmp_path / "out" / name).is_file() for name in meta["filenames"])
     assert not [name for name in files(tmp_path) if "tmp" in name]
 

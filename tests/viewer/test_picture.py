@@ -168,7 +168,8 @@ def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, 
     rows.text = True
     rows.write(tmp_path / "ascii.ply")
     splat_transform("--version")
-    shutil.copy(PACKED, tmp_path)
+    for path in (PACKED, PACKED.with_name("capture.sog")):
+        shutil.copy(path, tmp_path)
     folder = tmp_path / "temporary"
     folder.mkdir()
     with patch("tempfile.tempdir", str(folder)):
@@ -195,14 +196,6 @@ def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, 
         assert list(folder.iterdir()) == []
     assert all("422" in error for error in shown.errors) and len(shown.errors) == len(refused)
     shown.errors.clear()
-
-
-def test_a_sog_is_read_by_the_server(show, model, tmp_path):
-    splat_transform("-g", "cpu", "-i", "1", model, tmp_path / "a.sog")
-    shown = show(model, "--sv", 0)
-    drop(shown, "a.sog", (tmp_path / "a.sog").read_bytes())
-    shown.until("document.title === 'a.sog'")
-    assert shown.counts()["total"] == 400 and shown.page.is_disabled("#dial")
 
 
 def test_other_files_are_errors_and_the_picture_stays(show, model, tmp_path):
