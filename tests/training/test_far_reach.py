@@ -5,6 +5,7 @@ import torch
 
 from clod_adapter import make_plan
 from clod_adapter.progress import Phase
+from clod_adapter.training import camera_placement
 from clod_adapter.training.far_reach import fit_far_reach
 from clod_adapter.training.pseudo_views import with_pseudo_views
 from runs import config_of
@@ -15,7 +16,10 @@ from scenes import assert_equal, capture
 def started():
     """Gaussians before training, and the pseudo views to train on."""
     base, _ = capture()
-    views = with_pseudo_views(base, None, 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(camera_placement, "WIDTH", 124)
+        patch.setattr(camera_placement, "HEIGHT", 92)
+        views = with_pseudo_views(base, None, 0)
     return make_plan(base, views, config_of()).start, views.train
 
 
