@@ -285,8 +285,8 @@ def test_a_dial_is_attached_where_attaching_failed_before(tabs, viewer, given, f
                 return [failed, (await attach({given})).file.count];
             }}"""
             failed, count = page.evaluate(script)
-            assert "Error" in failed, call
-            assert count == page.evaluate("dial.file.count"), call
+            assert "Error" in failed
+            assert count == page.evaluate("dial.file.count")
 
 
 def test_dials_that_hold_a_rate_share_the_frame(tabs):

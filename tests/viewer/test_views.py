@@ -303,25 +303,22 @@ def test_the_up_axis(shown, show, save, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "lines, up, pages",
+    "lines, up",
     [
-        ("comment Vertical Axis: z", [0, 0, 1], ()),  # nerfstudio
-        ("comment Vertical axis: y", [0, -1, 0], ()),  # Brush, before it knew others
-        (
-            "comment Vertical axis: 0.6 0 -0.8\ncomment Vertical axis: 0 0 0",
-            [0.6, 0, -0.8],
-            (True, False),
-        ),
-        ("comment vertical axis: [3e1, -40, 0.]", [0.6, -0.8, 0], ()),
-        ("comment Vertical axis: 1 2", None, (False,)),
+        ("comment Vertical Axis: z", [0, 0, 1]),  # nerfstudio
+        ("comment Vertical axis: y", [0, -1, 0]),  # Brush, before it knew others
+        ("comment Vertical axis: 0.6 0 -0.8\ncomment Vertical axis: 0 0 0", [0.6, 0, -0.8]),
+        ("comment vertical axis: [3e1, -40, 0.]", [0.6, -0.8, 0]),
+        ("comment Vertical axis: 1 2", None),
     ],
 )
-def test_the_up_axis_that_a_file_states(shown, show, save, tmp_path, lines, up, pages):
+def test_the_up_axis_that_a_file_states(shown, show, save, tmp_path, lines, up):
     """Of a file that is opened, of the page's own, exact or not, and of a poster."""
     model, normal = ground(np.radians(25))
     path = save(model.replace(sigma_d=None, growth_d=None, attenuation=None))
     header, _, rows = path.read_bytes().partition(b"end_header")
     path.write_bytes(header + lines.encode() + b"\nend_header" + rows)
+    pages = up is None or "\n" in lines  # each would take a second
     says = "found from the scene" if up is None else "as the file states"
     up = np.array(normal if up is None else up, float)
     within = np.cos(np.radians(5 if says.startswith("found") else 0.01))
@@ -329,7 +326,7 @@ def test_the_up_axis_that_a_file_states(shown, show, save, tmp_path, lines, up, 
     assert up_axis(saved.gaussians, saved.comments) @ up > within
     take(shown, path)
     opened = [shown]
-    for exact in pages:
+    for exact in (True, False) if pages else ():
         write_viewer_page(tmp_path / "page.html", saved, exact=exact)
         opened.append(show(url=(tmp_path / "page.html").as_uri()))
     for each in opened:
