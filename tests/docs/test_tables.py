@@ -6,7 +6,6 @@ import json
 import re
 import runpy
 import shutil
-import sys
 
 import pytest
 import results
@@ -37,7 +36,6 @@ def test_the_build_names_tables_of_other_rows(copy, monkeypatch, capfd):
     alter(rows / "stream.jsonl", lambda row: row.update(commit="0ld"), scene="taebak4")
     alter(rows / "stability.jsonl", lambda row: row["machine"].update(threads=7), part="popping")
     alter(rows / "walk.jsonl", lambda row: row["dial"][0].update(psnr=99.0))
-    monkeypatch.setattr(sys, "argv", ["make.py"])
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(copy / "docs" / "make.py"), run_name="__main__")
