@@ -17,6 +17,7 @@ from clod_adapter.equation.attenuation import (
     takeover_distance,
 )
 from clod_adapter.equation.distances import Place, typical_distance
+from clod_adapter.equation.units import nominal_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.initialization.merging import merge
@@ -29,6 +30,9 @@ GROWN = 0.9
 MOST = 100.0  # multiplier of the distances at which levels begin
 FEWEST = 0.01  # share of the Gaussians in the coarsest level
 LEVELS = 16  # the largest number of levels
+# Times max_sv and the reference distance, beyond which levels are merged: what is trained there is
+# too little, of captures with photographs above all.
+TRAINED = 4.0
 
 
 @torch.no_grad()
@@ -106,7 +110,9 @@ def bake_levels(gaussians: Gaussians, multiplier: float = MULTIPLIER) -> list[Le
     k >= 1 is for the distances from ``H m^(k - 1)`` to ``H m^k``, with m the multiplier and H the
     ``near_distance``, or else the median reach. It has the Gaussians whose reach is beyond the
     middle of its band, ``H m^(k - 1/2)``, with the opacities of its beginning and the scales of its
-    middle. The last level has at least FEWEST of the Gaussians.
+    middle. The last level has at least FEWEST of the Gaussians. A level that begins beyond TRAINED
+    times ``max_sv`` reference distances is the one before it, merged until as many remain
+    (``merging.merge``).
 
     Raises:
         ClodError: no dial, the paper's form, whose distances depend on the view, or a multiplier
@@ -133,11 +139,18 @@ def bake_levels(gaussians: Gaussians, multiplier: float = MULTIPLIER) -> list[Le
     begins = (
         attenuation.near_distance or float(gaussians.sigma_d.median()) * attenuation.scene_distance
     )
+    typical = nominal_distance(gaussians.means, attenuation) * attenuation.scene_distance
+    trained = TRAINED * attenuation.max_sv * typical
     while len(levels) < LEVELS:
         middle = seen_from(begins * math.sqrt(multiplier))
-        if int(middle.keep.sum()) < max(FEWEST * gaussians.whole, 1):
+        count = int(middle.keep.sum())
+        if count < max(FEWEST * gaussians.whole, 1):
             break
-        levels.append(Level(begins, _plain(gaussians, middle, seen_from(begins), middle)))
+        if begins <= trained:
+            level = _plain(gaussians, middle, seen_from(begins), middle)
+        else:
+            level = merge(levels[-1].gaussians, count)
+        levels.append(Level(begins, level))
         begins *= multiplier
     return levels
 

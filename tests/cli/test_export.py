@@ -29,6 +29,7 @@ from clod_adapter import (
 )
 from clod_adapter.evaluation.agreement import agreement
 from clod_adapter.harmonics import with_sh_degree
+from clod_adapter.initialization.merging import merge
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_layout import write_comments
 from clod_adapter.io.settings import Metadata
@@ -152,6 +153,18 @@ def test_sets_have_a_level_for_each_band_of_distances(clod, attenuated, tmp_path
         assert len(level.gaussians) == counts[k]
     root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
     assert root["geometricError"] > root["children"][0]["geometricError"] >= 0
+
+
+def test_levels_beyond_the_trained_distances_are_merged(attenuated):
+    model = load(attenuated).gaussians
+    short = replace(model.attenuation, max_sv=1.0, reference_distance=0.01)
+    trained = bake_levels(model, 1.5)
+    merged = bake_levels(model.replace(attenuation=short), 1.5)
+    assert [level.begins for level in merged] == [level.begins for level in trained]
+    for before, level, like in zip(merged[:-1], merged[1:], trained[1:], strict=True):
+        assert len(level.gaussians) <= len(like.gaussians) + 1
+        want = merge(before.gaussians, len(like.gaussians))
+        assert torch.equal(level.gaussians.means, want.means)
 
 
 def test_tuned_files_show_the_photographs_better(clod, capture, attenuated):
