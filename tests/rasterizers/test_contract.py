@@ -38,7 +38,7 @@ def test_for_device(monkeypatch):
 def test_same_input_same_bits(rasterize):
     view, some = camera(130, 97), scene(300 if rasterize.stands_in else 2000, 2, 1)
     given, results = {name: value.clone() for name, value in some.items()}, {}
-    for count in (1, 1) if rasterize.stands_in else (1, 1, 2, 2, 3):
+    for count in (1, 1, 2, 2, 3):
         with torch_threads(count):
             found = differentiate(rasterize, some, view, weights(view))
         assert_same(found, results.setdefault(count, found), **rasterize.rounding)

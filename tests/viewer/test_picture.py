@@ -177,8 +177,11 @@ def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, 
         for path in sorted(path for path in tmp_path.glob("*.*") if path != model):
             drop(shown, path.name, path.read_bytes())
             shown.until(f"document.title === '{path.name}'")
+            opened = load(path).gaussians
+            assert shown.counts()["total"] == len(opened)
+            assert shown.page.is_disabled("#dial") == (opened.sigma_d is None)
             shown.camera(VIEW)
-            assert_same(shown, render(load(path).gaussians, VIEW, 1.0))
+            assert_same(shown, render(opened, VIEW, 1.0))
         before = shown.picture()
         refused = (
             ("cut.pt", (tmp_path / "a b&.pt").read_bytes()[:200], "cut.pt: is damaged"),
