@@ -67,7 +67,7 @@ def make_quality_table(
     assert measured.attenuation is not None
     camera = scene.test[0].camera
     machine = machine_name(measured.means.device.type)
-    stored = list(spread(scene.train, VIEWPOINTS))
+    stored = list(spread(tuple(dict.fromkeys(scene.train)), VIEWPOINTS))  # each once
     if against != "photographs":  # of placed cameras some look at little; viewers open at the first
         stored.sort(key=_interest, reverse=True)
     return QualityTable.of(

@@ -68,10 +68,13 @@ def test_few_photographs_get_pseudo_views(blob, monkeypatch):
     enough = Scene(around, ())
     assert add_pseudo_views(blob, enough) == enough
     scene = add_pseudo_views(blob, Scene(around[:1], around[1:]))
-    assert scene.train[0] is around[0] and len(scene.train) == 1 + 9 and scene.test == around[1:]
+    assert scene.train[:4] == 4 * around[:1] and scene.test == around[1:]
     assert "only 1 photographs to train on: 9 pseudo views" in scene.notes[-1]
+    assert "each photograph is used 4 times" in scene.notes[-1]
     place = around[0].camera.viewmat
-    assert sum(torch.equal(view.camera.viewmat, place) for view in scene.train) == 1 + 4
+    pseudo = scene.train[4:]
+    assert len(pseudo) == 9
+    assert sum(torch.equal(view.camera.viewmat, place) for view in pseudo) == 4
     assert len(add_pseudo_views(blob, Scene(around[1:], ())).train) == 11 + 11 + 4
     # too faint to place a camera by
     faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))
