@@ -66,10 +66,13 @@ def main():
     parser.add_argument("--author", nargs="+", type=Path, default=[], help=text)
     args = parser.parse_args()
     base = clod.load(args.scene).gaussians
-    views = more = clod.load_scene(args.images).test if args.images else rendered(base)
-    if not args.images:  # where what is near counts most, few views disagree by decibels
+    if args.images:
+        scene, views = args.images.name, clod.load_scene(args.images).test
+        more = views
+    else:
+        scene, views = args.scene.stem, rendered(base)
+        # of plain files, where what is near counts most, few views disagree by decibels
         more = rendered(base, 4 * VIEWS)
-    scene = args.images.name if args.images else args.scene.stem
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         out = folder / "adapted.ply"
@@ -127,17 +130,13 @@ def of_sets(base, sets, views):
     """Each set at each budget, with the multiplier that is best of those that meet it."""
     frames = Frames(base)
     for name, by_multiplier in sets.items():
-        found = {}
-        for multiplier, levels in by_multiplier.items():
-            drawn = Levels(levels, multiplier, frames)
-            for budget in BUDGETS:
-                row = {"method": name, **measured(drawn, views, budget, len(base))}
-                row["multiplier"] = multiplier
-                best = found.setdefault(row["level"], row)
-                found[row["level"]] = max(
-                    best, row, key=lambda each: (within(each, budget), each["psnr"])
-                )
-        yield from found.values()
+        drawn = {each: Levels(levels, each, frames) for each, levels in by_multiplier.items()}
+        for budget in BUDGETS:
+            rows = []
+            for multiplier, shown in drawn.items():
+                row = {"method": name, **measured(shown, views, budget, len(base))}
+                rows.append(row | {"multiplier": multiplier})
+            yield max(rows, key=lambda row: (within(row, budget), row["psnr"]))
 
 
 def within(row, budget):
