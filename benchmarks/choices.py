@@ -3,7 +3,7 @@ change at a time.
 
     python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full
     python benchmarks/choices.py demo --names SHARE full    # the folder of clod-adapt demo
-    python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER    # no photographs
+    python benchmarks/choices.py SCENE.ply    # no photographs
 
 A scene is a folder of the shared data, one of the demo, or a file, whose placed cameras and renders
 are used. Each run adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice is
@@ -36,21 +36,22 @@ from stream import rendered
 
 FILE, MAX_SV = "choices.jsonl", 7.0  # of captures, as adapt.jsonl has them
 ALTERNATIVES: dict[str, tuple[Any, ...]] = {
-    "SHARE": (0.4, 0.6),
+    "SHARE": (0.6, 0.4),
     "NEARER": (0.3, 0.5),
-    "PLACED_SHARE": (0.8,),
-    "PLACED_NEARER": (0.2, 0.5),
-    "PLACED_CONTRAST": (1.0,),
-    "LONGER": (1.0,),
     "full": (0.0, 0.5),
-    "coarse": (0.0, 0.9),
-    "average": (0.0,),
+    "coarse": (0.0,),
     "growth": ("off",),
+    "average": (0.0,),
     "reg_weight": (0.5, 2.0),
     "lr_sigma": (0.025, 0.1),
     "lr_growth": (0.006, 0.024),
     "lr_opacities": (0.05, 0.2),
     "lr_means": (0.03, 0.12),
+}
+PLACED: dict[str, tuple[Any, ...]] = {  # without photographs
+    "PLACED_SHARE": (0.8,),
+    "PLACED_NEARER": (0.2, 0.5),
+    "PLACED_CONTRAST": (1.0,),
     "exponent": (1.5, 2.0),
 }
 SHOWN = {  # in the table
@@ -80,13 +81,13 @@ SHOWN_PLACED = {  # without photographs
 def main():
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--names", nargs="+", choices=ALTERNATIVES, default=list(ALTERNATIVES))
+    parser.add_argument("--names", nargs="+", choices=[*ALTERNATIVES, *PLACED])
     args = parser.parse_args()
     for scene in args.scenes:
         base, views = inputs(scene)
         measure(scene, base, views, "default", None)
-        for name in args.names:
-            for value in ALTERNATIVES[name]:
+        for name in args.names or (PLACED if scene.endswith(".ply") else ALTERNATIVES):
+            for value in (ALTERNATIVES | PLACED)[name]:
                 measure(scene, base, views, name, value)
 
 
