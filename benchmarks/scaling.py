@@ -56,10 +56,10 @@ def timed(name, run, *given):
     spent[name + "_cpu"] = time.process_time() - cpu
     return found
 g = timed("load", load, Path(sys.argv[1]) / "city.ply").gaussians
-views = load_scene(sys.argv[1]).train
+cameras = [view.camera for view in load_scene(sys.argv[1]).train]
 few = g.select(torch.arange(min(len(g), 1000)))
-pruning_order(few, removal_error(few, views[:1]))  # compiled
-error = timed("importance", removal_error, g, views)
+pruning_order(few, removal_error(few, cameras[:1]))  # compiled
+error = timed("importance", removal_error, g, cameras)
 timed("order", pruning_order, g, error.sqrt() * g.opacities)
 print(json.dumps({name: round(value, 3) for name, value in spent.items()}))
 """

@@ -101,7 +101,8 @@ def _gradients(
 
 def by_importance(gaussians, views):
     """The Gaussians by falling removal error, equal ones in their order."""
-    return gaussians[removal_error(gaussians, views).argsort(descending=True, stable=True)]
+    cameras = [view.camera for view in views]
+    return gaussians[removal_error(gaussians, cameras).argsort(descending=True, stable=True)]
 
 
 def find_tool():

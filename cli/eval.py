@@ -154,8 +154,8 @@ class Comparisons:
         from clod_adapter.initialization.importance import MOST_VIEWS, removal_error
 
         with self.console.meter("removal error") as meter:
-            views = spread(self.scene.train, MOST_VIEWS)
-            removal = removal_error(base, views, progress=self.stop.stop_on_signal(meter))
+            cameras = [view.camera for view in spread(self.scene.train, MOST_VIEWS)]
+            removal = removal_error(base, cameras, progress=self.stop.stop_on_signal(meter))
         values = {"opacity": base.opacity_logits, "removal error": removal}
         orders = {by: each.argsort(descending=True, stable=True) for by, each in values.items()}
         whole = self._row(base, 1.0, "base")
@@ -164,8 +164,8 @@ class Comparisons:
         for ours in rows:
             dial = ours.virtual_scale
             table.append((f"s={dial:g}", ours))
-            for by in orders:
-                pruned = base.select(orders[by][: round(ours.kept)])
+            for by, order in orders.items():
+                pruned = base.select(order[: round(ours.kept)])
                 row = self._row(pruned, 1.0, f"base by {by}")
                 row = replace(row, kept_share=row.kept / len(base))  # of the whole base
                 table.append((by, row))

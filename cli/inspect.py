@@ -39,7 +39,7 @@ def execute(args: Namespace) -> Report:
 
     found = inspect(args.file)
     print("\n".join(lines_of(found)))
-    return {**found.as_dict()}
+    return found.as_dict()
 
 
 def lines_of(found: Inspection) -> list[str]:

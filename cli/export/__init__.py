@@ -195,7 +195,8 @@ baking:
   distance to the training cameras of --images, else to those stored in MODEL,
   else to 16 placed ones. With --camera the file is exact at that camera.
   Where MODEL was adapted without photographs, and no --images is given, the
-  checkpoint is merged to as many too, and written if it looks more like itself.
+  checkpoint is merged to as many too, by importance in renders, and written if
+  it looks more like itself.
   --keep is exact. --psnr-drop and --fps use the quality table in MODEL; with
   --images, --fps times frames of MODEL on this machine.
 

@@ -7,6 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from torch import Tensor
+
 from clod_adapter import (
     Camera,
     ClodError,
@@ -23,6 +25,7 @@ from clod_adapter.bake import Level
 from clod_adapter.cameras import spread
 from clod_adapter.evaluation.agreement import agreement, merged_if_nearer
 from clod_adapter.harmonics import with_sh_degree
+from clod_adapter.initialization.importance import merging_weights
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import write
@@ -59,7 +62,7 @@ def export(args: Namespace) -> Report:
     """Reads, bakes and writes; prints what was written, and returns the report."""
     watch, export = Stopwatch(), Export(args)
     export.note_losses()
-    total, camera, written = export.gaussians.whole, export.camera, export.write()
+    total, written = export.gaussians.whole, export.write()
     for output in written:
         print(line_of(output, total))
         if args.folder and len(output["levels"]) > 1:
@@ -70,7 +73,7 @@ def export(args: Namespace) -> Report:
         "model": args.model,
         "files": [args.model, *args.others],
         "base_count": total,
-        "camera": camera.name if camera else None,
+        "camera": export.camera and export.camera.name,
         "cameras": len(export.cameras),
         "outputs": written,
         "notes": export.console.notes,
@@ -97,7 +100,7 @@ class Export:
 
     def __init__(self, args: Namespace) -> None:
         self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
-        renders = args.tune or (args.images is not None and args.fps)
+        renders = args.tune or (args.images and args.fps)
         device = inputs.pick_device(args.device, self.console) if renders else inputs.CPU
         self.model = inputs.read_model(args, args.model, self.console, device=device)
         self.tuning_views = self._find_tuning_views() if args.tune else ()
@@ -107,8 +110,8 @@ class Export:
         ]
         # cameras to bake or fit for, none where that is not asked for, and what they are
         self.cameras, self.about = self._find_cameras()
-        reads = self.page and args.images is not None  # cameras of the scene, for a page
-        self.views = inputs.read_cameras(self.model, args.images, self.console) if reads else []
+        given = self.page and args.images  # whose cameras a page has
+        self.views = inputs.read_cameras(self.model, given, self.console) if given else []
         if args.sh_degree:
             self._reduce_sh_degree(args.sh_degree)
         self.gaussians = self.model.gaussians
@@ -136,7 +139,7 @@ class Export:
         counts = given_budget(args) and not (self.page and args.psnr_drop)
         if not (args.levels or counts or args.sh_degree or (args.sv and not self.page)):
             return (), ""
-        if args.images is not None:
+        if args.images:
             cameras = inputs.read_cameras(
                 model, args.images, self.console, training=args.camera is None
             )
@@ -245,20 +248,14 @@ class Export:
         """The Gaussians of one file, baked if there is a dial value; and its comments, those of the
         model first.
         """
-        about, gaussians, cameras = [*self.model.comments], self.gaussians, self.about
+        about, gaussians = [*self.model.comments], self.gaussians
         if virtual_scale is not None:
-            if self.camera:
-                place = zip(self.camera.position.double().tolist(), self.model.origin, strict=True)
-                cameras = (
-                    f"the camera at ({', '.join(f'{x + by:.9g}' for x, by in place)}): exact from"
-                    " there only"
-                )
             baked = bake(
                 gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras
             )
             merged = self._merged(baked)
             how = "the checkpoint merged to as many as are kept" if merged else "baked"
-            about.append(f"{how} at s = {virtual_scale:.6g} by clod-adapter for {cameras}")
+            about.append(f"{how} at s = {virtual_scale:.6g} by clod-adapter for {self.about}")
             gaussians = merged or baked
             if self.args.tune:
                 about.append("tuned for this dial value")
@@ -272,9 +269,9 @@ class Export:
         """
         if self.args.images or not self.model.placed or len(baked) == self.gaussians.whole:
             return None
-        views = self._unseen
+        rival = self._rival
         with self.console.meter(Phase.MERGING) as meter:
-            merged = merged_if_nearer(baked, detach(self.gaussians), views, meter)
+            merged = merged_if_nearer(baked, *rival, meter)
         if merged:
             self.console.note(
                 f"{len(merged):,} Gaussians are the checkpoint's, merged: their renders are nearer"
@@ -283,11 +280,18 @@ class Export:
         return merged
 
     @cached_property
-    def _unseen(self) -> Sequence[Camera]:
-        """Views other than those that the dial was trained on."""
+    def _rival(self) -> tuple[Gaussians, Tensor, Sequence[Camera]]:
+        """The checkpoint, weights for merging it, and views to compare it in, which neither these
+        nor the dial are from.
+        """
         self._prepare()
+        checkpoint = detach(self.gaussians)
         with self.console.meter("placing cameras") as meter:
-            return place_cameras(self.gaussians, views=PLACED, seed=1, progress=meter)
+            views = place_cameras(checkpoint, views=PLACED, seed=1, progress=meter)
+            seen = place_cameras(checkpoint, progress=meter)
+            meter.begin("importance")
+            weights = merging_weights(checkpoint, seen, progress=meter)
+        return checkpoint, weights, views
 
     def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:
         """Writes a file, with notes on losses of the format; returns its number of Gaussians."""

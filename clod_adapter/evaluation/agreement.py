@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from statistics import fmean
 
+from torch import Tensor
+
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.merging import merge
@@ -27,12 +29,13 @@ def agreement(shown: Gaussians, exact: Gaussians, cameras: Sequence[Camera]) -> 
 def merged_if_nearer(
     baked: Gaussians,
     checkpoint: Gaussians,
+    weights: Tensor,
     cameras: Sequence[Camera],
     progress: Listener | None = None,
 ) -> Gaussians | None:
-    """The checkpoint merged to as many as are ``baked``, if its ``agreement`` with the checkpoint
-    is the larger one.
+    """The checkpoint merged by ``weights`` to as many as are ``baked``, if its ``agreement`` with
+    the checkpoint is the larger one.
     """
-    merged = merge(checkpoint, len(baked), progress=progress)
+    merged = merge(checkpoint, len(baked), weights, progress)
     nearer = agreement(merged, checkpoint, cameras) > agreement(baked, checkpoint, cameras)
     return merged if nearer else None

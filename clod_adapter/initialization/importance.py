@@ -18,6 +18,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians, largest_colour, nonfinite_rows
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.progress import Listener, Phase, tell
+from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.render import splat
 
 # Times the largest dial value, the largest extinction scale: beyond, a reach has no gradient in
@@ -26,6 +27,9 @@ WIDEST = 4.0
 # Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB
 # (docs/performance.md).
 MOST_VIEWS = 64
+# Exponent of the importance in merging. A dense checkpoint has many Gaussians that no placed view
+# shows larger than a pixel: these are merged first, and those that matter stay as they are.
+PLACED_CONTRAST = 3.0
 NEAREST_VIEWS = 0.05  # share of the views that may be nearer than where growth begins
 
 
@@ -68,7 +72,9 @@ def importance(
     """``[N]`` the weight of each Gaussian in the pictures: the root of its ``removal_error``, times
     its opacity.
     """
-    return removal_error(base, views, seed=config.seed, progress=progress).sqrt() * base.opacities
+    cameras = [view.camera for view in views]
+    error = removal_error(base, cameras, seed=config.seed, progress=progress)
+    return error.sqrt() * base.opacities
 
 
 def reach_of(
@@ -143,43 +149,64 @@ def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     return medians[max(math.ceil(NEAREST_VIEWS * len(medians)) - 1, second)]
 
 
+def merging_weights(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    contrast: float = PLACED_CONTRAST,
+    *,
+    unseen: bool = True,
+    seed: int = 0,
+    progress: Listener | None = None,
+) -> Tensor:
+    """``[N]`` weights for ``merging.merge``: the importance in the images of ``cameras``, to the
+    power of ``contrast``.
+
+    Args:
+        unseen: what no camera shows matters too, as much as what is shown.
+    """
+    error = removal_error(gaussians, cameras, seed=seed, progress=progress)
+    if unseen:
+        error = _supposed_error(gaussians, error)
+    return (error.sqrt() * gaussians.opacities).double() ** contrast
+
+
 def removal_error(
     gaussians: Gaussians,
-    views: Sequence[View],
+    cameras: Sequence[Camera],
     *,
     seed: int = 0,
     progress: Listener | None = None,
 ) -> Tensor:
     """``[N]`` estimate of the squared image error of removing each Gaussian alone, mean over the
-    views.
+    cameras.
 
     To first order removing Gaussian i changes pixel p by ``a_i dC_p/da_i``. The sum of squares over
-    the pixels is estimated without bias by one backward pass per view: with random signs z,
+    the pixels is estimated without bias by one backward pass per camera: with random signs z,
     ``E[(sum_p z_p dC_p/da_i)^2] = sum_p (dC_p/da_i)^2`` (Hutchinson). Images have half the size,
     unless they are small, in a third of the time.
     """
     generator = torch.Generator().manual_seed(seed)
     total = torch.zeros_like(gaussians.means[:, 0])
     smaller = gaussians.replace(screen_filter=gaussians.screen_filter.halved())
-    for done, view in enumerate(views, 1):
+    for done, camera in enumerate(cameras, 1):
         opacities = gaussians.opacities.detach().requires_grad_()
-        if view.camera.halvable:
-            image, _ = splat(smaller, opacities, view.camera.halved())
+        if camera.halvable:
+            image, _ = splat(smaller, opacities, camera.halved())
         else:
-            image, _ = splat(gaussians, opacities, view.camera)
+            image, _ = splat(gaussians, opacities, camera)
         bits = torch.randint(0, 2, image.shape, generator=generator, dtype=torch.uint8)
         signs = bits.to(image.device).to(image) * 2 - 1
         # as grad_outputs they would import sympy
         (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)
         total += (gradient * opacities.detach()).square()
-        tell(progress, Phase.IMPORTANCE, done, len(views))
+        tell(progress, Phase.IMPORTANCE, done, len(cameras))
     count = int(nonfinite_rows(total).sum())
     if count:
         raise ClodError(
             f"the image error of removing each of {count:,} Gaussians is not finite;"
             f" {largest_colour(gaussians)}"
         )
-    return total / max(len(views), 1)
+    return total / max(len(cameras), 1)
 
 
 def extinction_from_rank(rank: Tensor, config: AdaptConfig, total: int | None = None) -> Tensor:
@@ -210,3 +237,18 @@ def coverage(
     image, _ = splat(plain, opacities, camera, growth=growth)
     (gradient,) = torch.autograd.grad(image[..., 0].sum(), grey)
     return gradient[:, 0, 0] / SH_C0
+
+
+def _supposed_error(gaussians: Gaussians, error: Tensor) -> Tensor:
+    """``[N]`` the error; of one that no view shows that of a shown one of equal ``opacity^2 area``,
+    in the median.
+
+    Rasterizers clamp alpha, where it has no derivative: Gaussians that opaque count as shown.
+    """
+    shown = (error > 0) | (gaussians.opacities > ALPHA_MAX)
+    area = gaussians.log_scales.sum(1) - gaussians.log_scales.amin(1)
+    expected = gaussians.opacities.square() * (area - area.median()).clamp(-30, 30).exp()
+    measured = shown & (error > 0)
+    if not bool(measured.any()):
+        return error
+    return torch.where(shown, error, expected * (error[measured] / expected[measured]).median())

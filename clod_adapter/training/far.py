@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from clod_adapter.cameras import View, spread
 from clod_adapter.config import AdaptConfig
@@ -23,18 +22,18 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, with_near
 from clod_adapter.initialization.importance import (
     MOST_VIEWS,
+    PLACED_CONTRAST,
     has_dial,
     importance,
     initialize,
+    merging_weights,
     reach_of,
-    removal_error,
     scene_distance,
     with_growth,
 )
 from clod_adapter.initialization.merging import merge
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.progress import Listener
-from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.training.pseudo_views import PseudoView, only_pseudo
 
 # The number of far Gaussians as a share of the near ones', and the share of the distances in all
@@ -44,9 +43,6 @@ from clod_adapter.training.pseudo_views import PseudoView, only_pseudo
 SHARE, NEARER = 0.8, 0.05
 FEW_SHARE = 1.0  # beside few photographs: what training cannot learn anew is not merged away
 PLACED_SHARE, PLACED_NEARER = 0.4, 0.6
-# Exponent of the importance in merging. A dense checkpoint has many Gaussians that no placed view
-# shows larger than a pixel: these are merged first, and those that matter stay as they are.
-PLACED_CONTRAST = 3.0
 LONGER = 1.2  # times near_distance, the smallest reach
 SAMPLE = 20_000  # Gaussians whose distances tell near_distance
 WITHOUT_FAR = (
@@ -87,10 +83,14 @@ def with_far(
     some = base.means[:: len(base) // SAMPLE + 1]
     distances = torch.cat([normalized_distances(some, camera, attenuation) for camera in cameras])
     near = float(distances.kthvalue(max(round(nearer * len(distances)), 1)).values)
-    error = removal_error(base, views, seed=config.seed, progress=progress)
-    if placed:  # such cameras do not show everything
-        error = supposed_error(base, error)
-    weights = (error.sqrt() * base.opacities).double() ** contrast
+    weights = merging_weights(
+        base,
+        cameras,
+        contrast,
+        unseen=placed,  # such cameras do not show everything
+        seed=config.seed,
+        progress=progress,
+    )
     far = merge(base, max(round(share * len(base)), 1), weights, progress)
     order = pruning_order(far, importance(far, views, config, progress), progress)
     distances = typical_distance(far.means, cameras, attenuation)
@@ -99,18 +99,3 @@ def with_far(
     attenuation = replace(attenuation, near_distance=near * attenuation.scene_distance)
     far = with_growth(far.replace(sigma_d=reach, attenuation=attenuation), config)
     return in_world_units(with_near(base, far))
-
-
-def supposed_error(gaussians: Gaussians, error: Tensor) -> Tensor:
-    """``[N]`` the error; of one that no view shows that of a shown one of equal ``opacity^2 area``,
-    in the median.
-
-    Rasterizers clamp alpha, where it has no derivative: Gaussians that opaque count as shown.
-    """
-    shown = (error > 0) | (gaussians.opacities > ALPHA_MAX)
-    area = gaussians.log_scales.sum(1) - gaussians.log_scales.amin(1)
-    expected = gaussians.opacities.square() * (area - area.median()).clamp(-30, 30).exp()
-    measured = shown & (error > 0)
-    if not bool(measured.any()):
-        return error
-    return torch.where(shown, error, expected * (error[measured] / expected[measured]).median())

@@ -23,7 +23,7 @@ ALL = frozenset(NAMES)
 def visible(captured):
     """A capture without unseen Gaussians."""
     base, scene = captured
-    return base.select(removal_error(base, scene.train) > 0), scene
+    return base.select(removal_error(base, [view.camera for view in scene.train]) > 0), scene
 
 
 def verdicts(plan):
