@@ -24,8 +24,8 @@ from clod_adapter.render import splat
 # Times the largest dial value, the largest extinction scale: beyond, a reach has no gradient in
 # training, and would never change.
 WIDEST = 4.0
-# Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB
-# (docs/performance.md).
+# Most photographs whose cameras are rendered: twice as many changed the trained result by 0.01 to
+# 0.04 dB.
 MOST_VIEWS = 64
 # Exponent of the importance in merging. A dense checkpoint has many Gaussians that no placed view
 # shows larger than a pixel: these are merged first, and those that matter stay as they are.

@@ -71,8 +71,9 @@ def with_far(
         return initialize(base, views, config)
     if has_dial(base):
         raise ClodError(WITHOUT_FAR)
-    views = spread(views, MOST_VIEWS)
     placed = only_pseudo(views)
+    if not placed:  # else each camera shows what others do not
+        views = spread(views, MOST_VIEWS)
     share, nearer, contrast = SHARE, NEARER, 1.0
     if placed:
         share, nearer, contrast = PLACED_SHARE, PLACED_NEARER, PLACED_CONTRAST
