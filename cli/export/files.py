@@ -287,7 +287,8 @@ class Export:
         self._prepare()
         checkpoint = detach(self.gaussians)
         with self.console.meter("placing cameras") as meter:
-            views = place_cameras(checkpoint, views=PLACED, seed=1, progress=meter)
+            # where what is near counts most, few views disagree by decibels
+            views = place_cameras(checkpoint, views=64, seed=1, progress=meter)
             seen = place_cameras(checkpoint, progress=meter)
             meter.begin("importance")
             weights = merging_weights(checkpoint, seen, progress=meter)
