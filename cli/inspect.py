@@ -98,12 +98,16 @@ def quality_lines(quality_table: QualityTable | None) -> list[str]:
     """The quality table of the file."""
     if quality_table is None:
         return [_line("quality", "none, so --fps and --psnr-drop cannot be solved from it")]
-    c = quality_table
-    about = f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}"
-    lines = [_line("quality", about)]
-    lines.append(_line("", f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}"))
+    about = (
+        f"against {quality_table.against}, {quality_table.views} views of"
+        f" {quality_table.width}x{quality_table.height}, on {quality_table.machine}"
+    )
+    lines = [
+        _line("quality", about),
+        _line("", f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}"),
+    ]
     numbers = "{:>6.3g}{:>12,.0f}{:>9.2f}{:>8.3f}{:>10.1f}"
-    return lines + [_line("", numbers.format(*astuple(row))) for row in c.rows]
+    return lines + [_line("", numbers.format(*astuple(row))) for row in quality_table.rows]
 
 
 def _block(name: str, says: Sequence[str]) -> list[str]:

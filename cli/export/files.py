@@ -25,7 +25,7 @@ from clod_adapter.bake import Level
 from clod_adapter.cameras import spread
 from clod_adapter.evaluation.agreement import agreement, merged_if_nearer
 from clod_adapter.harmonics import with_sh_degree
-from clod_adapter.initialization.importance import merging_weights
+from clod_adapter.initialization.importance import importance
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import write
@@ -115,12 +115,12 @@ class Export:
         if args.sh_degree:
             self._reduce_sh_degree(args.sh_degree)
         self.gaussians = self.model.gaussians
-        baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
+        baked = self.camera is None and not self.page
         dials = args.levels or solve_dials(
             args, self.model, self.cameras, self.console, baked=baked
         )
         if dials and self.page:
-            dials = [initial_dial(dials[0], attenuation, self.console)]
+            dials = [initial_dial(dials[0], self.gaussians.attenuation, self.console)]
         elif dials:
             dials = choose_dials(dials, self.model, self.console)
         self.dials: list[float] = dials or []  # which are baked, or the one at which a page opens
@@ -281,8 +281,8 @@ class Export:
 
     @cached_property
     def _rival(self) -> tuple[Gaussians, Tensor, Sequence[Camera]]:
-        """The checkpoint, weights for merging it, and views to compare it in, which neither these
-        nor the dial are from.
+        """The checkpoint, its importance, and views to compare in, which neither that nor the dial
+        is from.
         """
         self._prepare()
         checkpoint = detach(self.gaussians)
@@ -291,7 +291,7 @@ class Export:
             views = place_cameras(checkpoint, views=64, seed=1, progress=meter)
             seen = place_cameras(checkpoint, progress=meter)
             meter.begin("importance")
-            weights = merging_weights(checkpoint, seen, progress=meter)
+            weights = importance(checkpoint, seen, unseen=True, progress=meter)
         return checkpoint, weights, views
 
     def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 
 from clod_adapter.cameras import Scene, View, spread
-from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.budget import matching_dial
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
@@ -77,7 +76,8 @@ def draw(
 
 def merging(base: Gaussians, scene: Scene) -> Callable[[int], Gaussians]:
     """Merges the base to a count, by importance for the photographs, without training."""
-    weights = importance(base, spread(scene.train, MOST_VIEWS), AdaptConfig())
+    cameras = [view.camera for view in spread(scene.train, MOST_VIEWS)]
+    weights = importance(base, cameras)
     return partial(merge, base, importance=weights)
 
 

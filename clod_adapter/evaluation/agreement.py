@@ -11,6 +11,7 @@ from clod_adapter.initialization.merging import merge
 from clod_adapter.losses import decibels, mean_squared_error
 from clod_adapter.progress import Listener
 from clod_adapter.render import render
+from clod_adapter.training.far import PLACED_CONTRAST
 
 
 def agreement(shown: Gaussians, exact: Gaussians, cameras: Sequence[Camera]) -> float:
@@ -29,13 +30,14 @@ def agreement(shown: Gaussians, exact: Gaussians, cameras: Sequence[Camera]) -> 
 def merged_if_nearer(
     baked: Gaussians,
     checkpoint: Gaussians,
-    weights: Tensor,
+    importance: Tensor,
     cameras: Sequence[Camera],
     progress: Listener | None = None,
 ) -> Gaussians | None:
-    """The checkpoint merged by ``weights`` to as many as are ``baked``, if its ``agreement`` with
+    """The checkpoint merged by importance to as many as are ``baked``, if its ``agreement`` with
     the checkpoint is the larger one.
     """
+    weights = importance.double() ** PLACED_CONTRAST
     merged = merge(checkpoint, len(baked), weights, progress)
     nearer = agreement(merged, checkpoint, cameras) > agreement(baked, checkpoint, cameras)
     return merged if nearer else None

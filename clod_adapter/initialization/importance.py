@@ -27,9 +27,6 @@ WIDEST = 4.0
 # Most photographs whose cameras are rendered: twice as many changed the trained result by 0.01 to
 # 0.04 dB.
 MOST_VIEWS = 64
-# Exponent of the importance in merging. A dense checkpoint has many Gaussians that no placed view
-# shows larger than a pixel: these are merged first, and those that matter stay as they are.
-PLACED_CONTRAST = 3.0
 NEAREST_VIEWS = 0.05  # share of the views that may be nearer than where growth begins
 
 
@@ -57,24 +54,32 @@ def initialize(
         kept = base.replace(attenuation=settings)
         return in_world_units(with_growth(kept, config, base.growth_d))
     attenuation = config.attenuation(scene_distance(base, views))
-    order = pruning_order(base, importance(base, views, config, progress), progress)
-    distances = typical_distance(base.means, [view.camera for view in views], attenuation)
+    cameras = [view.camera for view in views]
+    weights = importance(base, cameras, seed=config.seed, progress=progress)
+    order = pruning_order(base, weights, progress)
+    distances = typical_distance(base.means, cameras, attenuation)
     initial = base.replace(sigma_d=reach_of(order, distances, config), attenuation=attenuation)
     return in_world_units(with_growth(initial, config))
 
 
 def importance(
-    base: Gaussians,
-    views: Sequence[View],
-    config: AdaptConfig,
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    *,
+    unseen: bool = False,
+    seed: int = 0,
     progress: Listener | None = None,
 ) -> Tensor:
-    """``[N]`` the weight of each Gaussian in the pictures: the root of its ``removal_error``, times
-    its opacity.
+    """``[N]`` the weight of each Gaussian in the images of ``cameras``: the root of its
+    ``removal_error``, times its opacity.
+
+    Args:
+        unseen: what no camera shows matters too, as much as what is shown.
     """
-    cameras = [view.camera for view in views]
-    error = removal_error(base, cameras, seed=config.seed, progress=progress)
-    return error.sqrt() * base.opacities
+    error = removal_error(gaussians, cameras, seed=seed, progress=progress)
+    if unseen:
+        error = _supposed_error(gaussians, error)
+    return error.sqrt() * gaussians.opacities
 
 
 def reach_of(
@@ -147,27 +152,6 @@ def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     medians = sorted(median_distance(base.means, view.camera) for view in views)
     second = 1 if len(medians) > 2 else 0
     return medians[max(math.ceil(NEAREST_VIEWS * len(medians)) - 1, second)]
-
-
-def merging_weights(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    contrast: float = PLACED_CONTRAST,
-    *,
-    unseen: bool = True,
-    seed: int = 0,
-    progress: Listener | None = None,
-) -> Tensor:
-    """``[N]`` weights for ``merging.merge``: the importance in the images of ``cameras``, to the
-    power of ``contrast``.
-
-    Args:
-        unseen: what no camera shows matters too, as much as what is shown.
-    """
-    error = removal_error(gaussians, cameras, seed=seed, progress=progress)
-    if unseen:
-        error = _supposed_error(gaussians, error)
-    return (error.sqrt() * gaussians.opacities).double() ** contrast
 
 
 def removal_error(

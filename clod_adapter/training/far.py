@@ -22,11 +22,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, with_near
 from clod_adapter.initialization.importance import (
     MOST_VIEWS,
-    PLACED_CONTRAST,
     has_dial,
     importance,
     initialize,
-    merging_weights,
     reach_of,
     scene_distance,
     with_growth,
@@ -43,6 +41,9 @@ from clod_adapter.training.pseudo_views import PseudoView, only_pseudo
 SHARE, NEARER = 0.8, 0.05
 FEW_SHARE = 1.0  # beside few photographs: what training cannot learn anew is not merged away
 PLACED_SHARE, PLACED_NEARER = 0.4, 0.6
+# Exponent of the importance in merging. A dense checkpoint has many Gaussians that no placed view
+# shows larger than a pixel: these are merged first, and those that matter stay as they are.
+PLACED_CONTRAST = 3.0
 LONGER = 1.2  # times near_distance, the smallest reach
 SAMPLE = 20_000  # Gaussians whose distances tell near_distance
 WITHOUT_FAR = (
@@ -84,16 +85,11 @@ def with_far(
     some = base.means[:: len(base) // SAMPLE + 1]
     distances = torch.cat([normalized_distances(some, camera, attenuation) for camera in cameras])
     near = float(distances.kthvalue(max(round(nearer * len(distances)), 1)).values)
-    weights = merging_weights(
-        base,
-        cameras,
-        contrast,
-        unseen=placed,  # such cameras do not show everything
-        seed=config.seed,
-        progress=progress,
-    )
-    far = merge(base, max(round(share * len(base)), 1), weights, progress)
-    order = pruning_order(far, importance(far, views, config, progress), progress)
+    # placed cameras do not show everything
+    weights = importance(base, cameras, unseen=placed, seed=config.seed, progress=progress)
+    far = merge(base, max(round(share * len(base)), 1), weights.double() ** contrast, progress)
+    far_weights = importance(far, cameras, seed=config.seed, progress=progress)
+    order = pruning_order(far, far_weights, progress)
     distances = typical_distance(far.means, cameras, attenuation)
     reach = reach_of(order, distances, replace(config, start_share=1.0), len(base))
     reach = reach.clamp(min=LONGER * near)
