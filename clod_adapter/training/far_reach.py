@@ -8,6 +8,7 @@ nothing tells which: merged Gaussians are no measure of trained ones.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -16,7 +17,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import View, spread
+from clod_adapter.cameras import View
 from clod_adapter.equation.attenuation import dial, kept_between, smallest_dial
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
@@ -26,12 +27,10 @@ from clod_adapter.render import render
 from clod_adapter.training.schedule import FAR
 
 BUDGETS = (0.4, 0.18, 0.08, 0.04)  # shares of the near Gaussians' number, as viewers have them
-MEASURED_VIEWS = 24  # few are all easy, or all hard: at 8 % views differ by 10 dB
+MEASURED_VIEWS = 24  # few are all easy, or all hard; the first ones see what photographs would
 STEP = 1.15  # factor between the reaches that are tried
 MOST_STEPS = 8
 FARTHEST = 1e3  # dial value at which the search for one ends
-EXACT = 1e-10  # squared error below which pictures are equal
-LOSS = 0.1  # dB that one budget may lose for the others
 PRECISION = 1e-3  # of the dial value that meets a budget
 
 
@@ -43,8 +42,9 @@ def fit_far_reach(
 ) -> Gaussians:
     """The Gaussians with the reach of far ones whose pictures differ least from those of the views.
 
-    Divides it by STEP, or multiplies, as long as that improves the mean of the PSNR over BUDGETS,
-    at equal counts, and no budget has lost more than LOSS. Budgets beyond the dial values that were
+    Divides it by STEP, or multiplies, as long as the RMS error of a picture becomes smaller in the
+    mean over views and BUDGETS, at equal counts. Of decibels those of nearly equal pictures would
+    decide, and of squared errors those of a few views. Budgets beyond the dial values that were
     counted in training do not matter.
     Where ``progress`` returns False, the best one so far is the result.
     """
@@ -53,7 +53,7 @@ def fit_far_reach(
     farthest = FAR.counted * config.max_sv
     measured = []
     kept = []
-    for view in spread(views, MEASURED_VIEWS):
+    for view in views[:MEASURED_VIEWS]:
         distances = normalized_distances(gaussians.means, view.camera, config)
         measured.append((view.camera, view.image, distances))
         kept.append(int(dial(gaussians, distances, farthest).keep.sum()))
@@ -63,31 +63,29 @@ def fit_far_reach(
         return gaussians
     tried = 0
 
-    def quality(candidate: Gaussians) -> Tensor:
-        """PSNR at each of the counts, dB."""
+    def error(candidate: Gaussians) -> float:
         nonlocal tried
         tell(progress, Phase.FAR_REACH, tried, 2 * MOST_STEPS)
         tried += 1
-        errors = torch.zeros(len(measured), len(counts), dtype=torch.float64)
-        for i, (camera, image, distances) in enumerate(measured):
+        errors = []
+        for camera, image, distances in measured:
             between = kept_between(candidate, distances)
-            for k, count in enumerate(counts):
+            for count in counts:
                 rendered = render(candidate, camera, virtual_scale=_dial_for(between, count))
-                errors[i, k] = mean_squared_error(rendered.image, image)
-        return -10 * (errors.mean(0) + EXACT).log10()
+                errors.append(math.sqrt(mean_squared_error(rendered.image, image)))
+        return fmean(errors)
 
     with suppress(Stopped):
-        best = highest = quality(gaussians)
+        smallest = error(gaussians)
         for factor in (1 / STEP, STEP):
             start = gaussians
             for _ in range(MOST_STEPS):
                 candidate = _with_reach(gaussians, factor)
-                found = quality(candidate)
-                if found.mean() <= best.mean() or (highest - found).max() > LOSS:
+                found = error(candidate)
+                if found >= smallest:
                     break
                 gaussians = candidate
-                best = found
-                highest = highest.maximum(found)
+                smallest = found
             if gaussians is not start:
                 break
     return gaussians
