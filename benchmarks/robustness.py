@@ -26,10 +26,9 @@ def main():
         words = ("--images", folder, "--max-sv", *RANGES, "--out", place)
         clod_adapt("robustness", *bases, *words)
         report = Path(place) / FILE.name
-        row = json.loads(report.read_text("utf-8")) | about()
+        text = report.read_text("utf-8").replace(str(folder), SCENE).replace(f"{place}/", "")
+        row = json.loads(text) | about()
         shutil.copy(report.with_suffix(".csv"), RESULTS)
-    for base in row["checkpoints"]:
-        base["model"] = f"{SCENE}/{Path(base['model']).name}"
     FILE.write_text(json.dumps(row), encoding="utf-8")
 
 

@@ -100,3 +100,8 @@ def test_every_benchmark_of_the_pages_is_a_task():
     assert named - OTHERS <= set(commands)
     assert all((ROOT / "benchmarks" / script).is_file() for script in commands)
     assert {name for task in results.tasks() for name in task.tables} <= set(results.TABLES)
+
+
+def test_no_row_names_a_path_of_the_machine():
+    for file in (ROOT / "benchmarks" / "results").iterdir():
+        assert not re.search(r'"/\w+/', file.read_text("utf-8")), file.name
