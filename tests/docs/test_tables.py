@@ -13,7 +13,7 @@ from common import ROOT
 
 LEFT_OUT = shutil.ignore_patterns("cache", "faults", "images", "__pycache__")
 # of pictures, of bases, and of what has no number
-OTHERS = {"results.py", "pictures.py", "faults.py"}
+OTHERS = {"results.py", "faults.py"}
 
 
 @pytest.fixture
