@@ -3,7 +3,7 @@
     python benchmarks/scaling.py    # some 15 minutes, 12 GB of memory, 8 GB of disk
 
 Runs each command in its own process on synthetic towns, which are kept in benchmarks/cache.
-Measures wall and CPU seconds and peak memory. A town of 1000 Gaussians gives the start-up cost.
+Measures wall and CPU seconds and peak memory. The smallest town gives the start-up cost.
 Rows go to results/scaling.jsonl; the last row of a kind counts.
 """
 
@@ -27,8 +27,8 @@ import numpy as np
 
 FILE = "scaling.jsonl"
 CITIES = CACHE / "scaling"
-FLOOR = 1000
-SIZES = (10_000, 100_000, 1_000_000, 5_000_000)
+FLOOR = 10_000
+SIZES = (FLOOR, 100_000, 1_000_000, 5_000_000)
 FROM = 100_000  # from which on exponents are fitted
 IMAGES = 10
 WIDTH = 640
@@ -70,7 +70,7 @@ def main():
     CITIES.mkdir(parents=True, exist_ok=True)
     for run in RUNS.values():
         run(town(FLOOR))  # compiles the kernels
-    for count, (command, run) in product((FLOOR, *SIZES), RUNS.items()):
+    for count, (command, run) in product(SIZES, RUNS.items()):
         cost = run(town(count))
         about = {"command": command, "gaussians": count, "busy": round(os.getloadavg()[0], 2)}
         append(FILE, {"series": "count", **about, **cost})
@@ -140,16 +140,21 @@ def exponent(points):
     return float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) > 1 else math.nan
 
 
+def measured():
+    """The rows by command and size."""
+    rows = last(FILE, "command", "gaussians", series="count")
+    return {key: row for key, row in rows.items() if key[1] in SIZES}
+
+
 def page_table():
     """Seconds by size, with the exponents above start-up, from FROM on."""
-    found = last(FILE, "command", "gaussians", series="count")
-    sizes = sorted({count for _, count in found})
+    found = measured()
     clocks = {command: (command, "seconds", "cpu_seconds") for command in RUNS}
     for part, name in PARTS_SHOWN.items():
         clocks[name] = ("adapt", f"{part}_seconds", f"{part}_cpu")
     lines = []
     for name, (command, wall, cpu) in clocks.items():
-        rows = [found[command, size] for size in sizes if (command, size) in found]
+        rows = [found[command, size] for size in SIZES]
         line = [name, *(f"{row.get(wall, math.nan):.3g}" for row in rows)]
         for clock in (wall, cpu):
             times = {row["gaussians"]: row.get(clock, math.nan) for row in rows}
@@ -157,14 +162,14 @@ def page_table():
             power = exponent([(n, time - floor) for n, time in times.items() if n >= FROM])
             line.append("" if math.isnan(power) else f"{power:.2f}")
         lines.append(line)
-    heads = ["seconds", *(f"{size:,}" for size in sizes), "exponent", "of CPU seconds"]
+    heads = ["seconds", *(f"{size:,}" for size in SIZES), "exponent", "of CPU seconds"]
     return Table(heads, lines, found.values())
 
 
 def memory_table():
     """Peak memory at the largest size, and bytes a Gaussian from the one before."""
-    found, lines = last(FILE, "command", "gaussians", series="count"), []
-    less, most = sorted({count for _, count in found})[-2:]
+    found, lines = measured(), []
+    less, most = SIZES[-2:]
     for command in RUNS:
         low, high = (found[command, count]["peak_bytes"] for count in (less, most))
         lines.append([command, f"{high / 1e9:.1f}", f"{(high - low) / (most - less):,.0f}"])
