@@ -41,11 +41,6 @@ ALTERNATIVES: dict[str, tuple[Any, ...]] = {
     "full": (0.0, 0.5),
     "coarse": (0.0,),
     "growth": ("off",),
-    "average": (0.0,),
-    "reg_weight": (0.5, 2.0),
-    "lr_sigma": (0.025, 0.1),
-    "lr_growth": (0.006, 0.024),
-    "lr_opacities": (0.05, 0.2),
     "lr_means": (0.03, 0.12),
 }
 PLACED: dict[str, tuple[Any, ...]] = {  # without photographs
@@ -119,8 +114,8 @@ def measure(scene, base, views, name, value):
 
 
 def page_table():
-    """The choices of SHOWN on three captures."""
-    return table(SHOWN, ("plush_half", "demo", "ci_banana"), (0.35, 0.12))
+    """The choices of SHOWN on two captures."""
+    return table(SHOWN, ("plush_half", "demo"), (0.35, 0.12))
 
 
 def placed_table():
