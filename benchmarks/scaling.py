@@ -1,6 +1,6 @@
 """Time and memory of the commands by the number of Gaussians.
 
-    python benchmarks/scaling.py    # some 15 minutes, 12 GB of memory, 8 GB of disk
+    python benchmarks/scaling.py    # some 30 minutes, 14 GB of memory, 8 GB of disk
 
 Runs each command in its own process on synthetic towns, which are kept in benchmarks/cache.
 Measures wall and CPU seconds and peak memory. The smallest town gives the start-up cost.
