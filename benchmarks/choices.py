@@ -14,7 +14,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 import clod_adapter as clod
@@ -35,21 +34,7 @@ from common import (
 from stream import rendered
 
 FILE, MAX_SV = "choices.jsonl", 7.0  # of captures, as adapt.jsonl has them
-ALTERNATIVES: dict[str, tuple[Any, ...]] = {
-    "SHARE": (0.6, 0.4),
-    "NEARER": (0.3, 0.5),
-    "full": (0.0, 0.5),
-    "coarse": (0.0,),
-    "growth": ("off",),
-    "lr_means": (0.03, 0.12),
-}
-PLACED: dict[str, tuple[Any, ...]] = {  # without photographs
-    "PLACED_SHARE": (0.8,),
-    "PLACED_NEARER": (0.2, 0.5),
-    "PLACED_CONTRAST": (1.0,),
-    "exponent": (1.5, 2.0),
-}
-SHOWN = {  # in the table
+CHOICES = {  # name and value, and what the table calls it
     ("default", None): "default",
     ("SHARE", 0.6): "0.6 times as many far ones",
     ("SHARE", 0.4): "0.4 times",
@@ -62,7 +47,7 @@ SHOWN = {  # in the table
     ("lr_means", 0.03): "half the rate of means",
     ("lr_means", 0.12): "twice",
 }
-SHOWN_PLACED = {  # without photographs
+PLACED = {  # without photographs
     ("default", None): "default",
     ("PLACED_SHARE", 0.8): "0.8 times as many, not 0.4",
     ("PLACED_NEARER", 0.2): "from the 20th percentile, not the 60th",
@@ -71,18 +56,18 @@ SHOWN_PLACED = {  # without photographs
     ("exponent", 1.5): "counts `s^-1.5`, not `s^-1.75`",
     ("exponent", 2.0): "counts `s^-2`",
 }
+NAMES = sorted({name for name, _ in CHOICES | PLACED} - {"default"})
 
 
 def main():
     parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--names", nargs="+", choices=[*ALTERNATIVES, *PLACED])
+    parser.add_argument("--names", nargs="+", choices=NAMES, default=NAMES)
     args = parser.parse_args()
     for scene in args.scenes:
         base, views = inputs(scene)
-        measure(scene, base, views, "default", None)
-        for name in args.names or (PLACED if scene.endswith(".ply") else ALTERNATIVES):
-            for value in (ALTERNATIVES | PLACED)[name]:
+        for name, value in PLACED if scene.endswith(".ply") else CHOICES:
+            if name in ("default", *args.names):
                 measure(scene, base, views, name, value)
 
 
@@ -114,13 +99,13 @@ def measure(scene, base, views, name, value):
 
 
 def page_table():
-    """The choices of SHOWN on two captures."""
-    return table(SHOWN, ("plush_half", "demo"), (0.35, 0.12))
+    """CHOICES on two captures."""
+    return table(CHOICES, ("plush_half", "demo"), (0.35, 0.12))
 
 
 def placed_table():
-    """Those of SHOWN_PLACED on large scenes; empty where one was not run."""
-    return table(SHOWN_PLACED, ("taebak4", "showroom3"), (0.35, 0.05))
+    """PLACED on large scenes; empty where one was not run."""
+    return table(PLACED, ("taebak4", "showroom3"), (0.35, 0.05))
 
 
 def table(choices, scenes, shares):
