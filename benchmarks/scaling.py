@@ -29,7 +29,7 @@ FILE = "scaling.jsonl"
 CITIES = CACHE / "scaling"
 FLOOR = 10_000
 SIZES = (FLOOR, 100_000, 1_000_000, 5_000_000)
-FROM = 1_000_000  # from which on exponents are fitted
+LARGE = SIZES[-2:]  # between which exponents and bytes per Gaussian are taken
 IMAGES = 10
 WIDTH = 640
 HEIGHT = 400
@@ -147,7 +147,7 @@ def measured():
 
 
 def page_table():
-    """Seconds by size, with the exponents above start-up, from FROM on."""
+    """Seconds by size, with the exponents above start-up, between LARGE."""
     found = measured()
     clocks = {command: (command, "seconds", "cpu_seconds") for command in RUNS}
     for part, name in PARTS_SHOWN.items():
@@ -158,8 +158,7 @@ def page_table():
         line = [name, *(f"{row.get(wall, math.nan):.3g}" for row in rows)]
         for clock in (wall, cpu):
             times = {row["gaussians"]: row.get(clock, math.nan) for row in rows}
-            floor = times.get(FLOOR, 0.0)
-            power = exponent([(n, time - floor) for n, time in times.items() if n >= FROM])
+            power = exponent([(n, times[n] - times[FLOOR]) for n in LARGE])
             line.append("" if math.isnan(power) else f"{power:.2f}")
         lines.append(line)
     heads = ["seconds", *(f"{size:,}" for size in SIZES), "exponent", "of CPU seconds"]
@@ -169,7 +168,7 @@ def page_table():
 def memory_table():
     """Peak memory at the largest size, and bytes a Gaussian from the one before."""
     found, lines = measured(), []
-    less, most = SIZES[-2:]
+    less, most = LARGE
     for command in RUNS:
         low, high = (found[command, count]["peak_bytes"] for count in (less, most))
         lines.append([command, f"{high / 1e9:.1f}", f"{(high - low) / (most - less):,.0f}"])

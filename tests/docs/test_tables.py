@@ -12,7 +12,7 @@ import results
 from common import ROOT
 
 LEFT_OUT = shutil.ignore_patterns("cache", "faults", "images", "__pycache__")
-# of pictures, of bases, and of what has no number
+# what runs the tasks, and what has no number
 OTHERS = {"results.py", "faults.py"}
 
 
