@@ -36,7 +36,6 @@ import robustness
 import scaling
 import stability
 import stream
-import tradeoff
 import walk
 from common import ROOT, SHARED, Table, about, arguments, last
 
@@ -56,7 +55,6 @@ TABLES: dict[str, Callable[[], Table]] = {
     "robustness": robustness.page_table,
     "scaling": scaling.page_table,
     "scaling-memory": scaling.memory_table,
-    "tradeoff": tradeoff.page_table,
     "walk": walk.page_table,
 }
 for module, parts in (

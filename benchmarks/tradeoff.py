@@ -1,38 +1,39 @@
-"""Held-out error against seconds of training: ours, the paper's form, prefixes, a specialist for
-each dial value.
+"""Error against seconds of preparation: ours, the paper's form, prefixes and a specialist for each
+dial value on held-out photographs; ours and halved sets on a large scene.
 
-    python benchmarks/tradeoff.py plush_half
-    python benchmarks/tradeoff.py plush_half --plot    # docs/images/error_vs_time.png, stored rows
+    python benchmarks/tradeoff.py plush_half bonsai146 SCENE.ply
+    python benchmarks/tradeoff.py    # docs/images/error_vs_time.png of the stored rows
 
 Each number of steps is a separate run with its own schedule. A specialist is the base merged to the
 count that ours keeps at that dial value, by the better of splat-transform's methods, then tuned for
 as many steps; at s = 1 the whole base, tuned. Prefixes are one file, ordered by removal error and
-tuned with random prefixes, of which the same counts are measured. Each run adds a row to
-``results/tradeoff.jsonl``.
+tuned with random prefixes, of which the same counts are measured. SCENE.ply, without photographs,
+is drawn by the rule of ``stream.py``, and a time is that of the whole command. Each run adds a row
+to ``results/tradeoff.jsonl``.
 """
 
+import tempfile
 import time
 from functools import partial
 from itertools import product
+from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter.report.charts import draw_training, new_figure, save_figure
 from common import (
     ROOT,
-    Row,
-    Table,
     append,
     arguments,
     checkpoint,
+    clod_adapt,
     last,
     photographs,
-    psnr_kept,
     quality,
-    stored,
 )
+from stream import BUDGETS, MULTIPLIERS, SETS, Dial, halved, measured, of_sets, rendered
 from tuning import Tuning, by_importance, merge, tune
 
-FILE, SCENE = "tradeoff.jsonl", "plush_half"  # of the page
+FILE = "tradeoff.jsonl"
 PICTURE = ROOT / "docs" / "images" / "error_vs_time.png"
 ITERS = (150, 400, 1200)
 MAX_SV, DIALS = 5.0, (1.0, 3.0, 5.0)
@@ -41,34 +42,60 @@ LABELS = {
     "paper": "the paper's form, one file",
     "prefix": "prefixes, one file",
     "specialist": "specialists, a file each",
+    "halved": "halved uniformly, a set",
+    "halved adaptively": "halved adaptively, a set",
+}
+AT_DIALS = [f"s = {s:g}" for s in DIALS]
+PANELS = {  # of a row of the picture
+    "plush_half": AT_DIALS,
+    "bonsai146": AT_DIALS,
+    "showroom3": [f"{budget:.0%} in each frame" for budget in BUDGETS],
 }
 
 
 def main():
     parser = arguments(__doc__)
-    parser.add_argument("scene", help="a folder of the shared data")
-    parser.add_argument("--plot", action="store_true", help="only draw the stored rows")
-    args = parser.parse_args()
-    if not args.plot:
-        base, views = checkpoint(args.scene), photographs(args.scene)
-        (untouched,) = quality(base.gaussians, views.test, 1.0)
-        for method, iters in product(LABELS, ITERS):
-            about = {"scene": args.scene, "method": method, "iters": iters, "max_sv": MAX_SV}
-            seconds, rows = METHODS[method](args.scene, base, views, iters)
-            append(FILE, {**about, "seconds": seconds, "base": untouched, "rows": rows})
-    plot(args.scene)
+    parser.add_argument("scenes", nargs="*", help="folders of the shared data, or files")
+    for scene in parser.parse_args().scenes:
+        runs = of_file if scene.endswith(".ply") else of_capture
+        for row in runs(scene):
+            append(FILE, {"scene": Path(scene).stem, **row})
+    plot()
 
 
-Runs = tuple[list[float], list[Row]]  # seconds to the file of each dial value, and its row
+def of_capture(scene):
+    base, views = checkpoint(scene), photographs(scene)
+    (untouched,) = quality(base.gaussians, views.test, 1.0)
+    for method, iters in product(METHODS, ITERS):
+        about = {"method": method, "iters": iters, "max_sv": MAX_SV, "base": untouched}
+        seconds, rows = METHODS[method](scene, base, views, iters)
+        yield {**about, "seconds": seconds, "rows": rows}
 
 
-def dial(
-    config_of,
-    scene,
-    base,
-    views,
-    iters,
-):
+def of_file(scene):
+    """At the budgets of a viewer."""
+    base = clod.load(scene).gaussians
+    views = rendered(base)
+    with tempfile.TemporaryDirectory() as temporary:
+        for iters in ITERS:
+            out = Path(temporary) / f"{iters}.ply"
+            words = ["--iters", iters, "--out", out, "--accept-loss", "--quiet"]
+            run = clod_adapt(scene, *words)
+            shown = Dial(clod.load(out).gaussians)
+            rows = [measured(shown, views, budget, len(base)) for budget in BUDGETS]
+            seconds = [run.seconds] * len(BUDGETS)
+            yield {"method": "ours", "iters": iters, "seconds": seconds, "rows": rows}
+        for method, option in SETS.items():
+            began = time.perf_counter()
+            files = halved(scene, option, Path(temporary) / method)
+            seconds = [time.perf_counter() - began] * len(BUDGETS)
+            levels = [clod.load(file).gaussians for file in (scene, *files)]
+            sets = {method: dict.fromkeys(MULTIPLIERS, levels)}
+            rows = list(of_sets(base, sets, views))
+            yield {"method": method, "seconds": seconds, "rows": rows}
+
+
+def dial(config_of, scene, base, views, iters):
     adapted = clod.adapt(base.gaussians, views, config_of(max_sv=MAX_SV, iters=iters))
     seconds = adapted.start_seconds + adapted.seconds
     return [seconds] * len(DIALS), quality(adapted.gaussians, views.test, DIALS)
@@ -98,7 +125,7 @@ def prefixes(scene, base, views, iters):
     return [ordering + tuning] * len(DIALS), rows
 
 
-METHODS = {
+METHODS = {  # to seconds and quality at each dial value
     "ours": partial(dial, clod.AdaptConfig),
     "paper": partial(dial, clod.AdaptConfig.paper),
     "prefix": prefixes,
@@ -117,41 +144,34 @@ def counts(scene):
     return [round(row["kept"]) for row in runs[max(runs)]["rows"]]
 
 
-def curves(scene, k):
-    """Lines by method at the k-th dial value, by rising time; of equal runs the last."""
-    runs = last(FILE, "method", "iters", scene=scene)
-    points = {method: [] for method in LABELS}
+def curves(runs, k):
+    """Lines by method in the k-th panel, by rising time."""
+    points = {}
     for (method, _), row in sorted(runs.items()):
-        point = row["rows"][k]
-        points[method].append({"seconds": row["seconds"][k], "psnr": point["psnr"]})
-    return [{"label": LABELS[method], "points": line} for method, line in points.items() if line]
+        point = {"seconds": row["seconds"][k], "psnr": row["rows"][k]["psnr"]}
+        points.setdefault(method, []).append(point)
+    return [
+        {"label": label, "points": points[method]}
+        for method, label in LABELS.items()
+        if method in points
+    ]
 
 
-def page_table():
-    """Seconds and quality of each run; the seconds of specialists are those of all their files."""
-    found = last(FILE, "method", "iters", scene=SCENE)
-    lines = []
-    for (method, iters), row in found.items():
-        seconds = sum(row["seconds"]) if method == "specialist" else row["seconds"][0]
-        cells = map(psnr_kept, row["rows"])
-        lines.append([LABELS[method], f"{iters:,}", f"{seconds:.0f}", *cells])
-    heads = ["", "steps", "seconds", *(f"s = {s:g}" for s in DIALS)]
-    return Table(heads, lines, found.values())
-
-
-def plot(scene):
-    """A panel a dial value: error against seconds of training."""
-    base = stored(FILE)[-1]["base"]
-    with new_figure((4.6 * len(DIALS), 4.3), layout="constrained") as figure:
-        title = f"{scene}: held-out error against time of training, {base['kept']:,.0f} Gaussians"
-        figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
-        for k, (axes, s) in enumerate(zip(figure.subplots(1, len(DIALS)), DIALS, strict=True)):
-            draw_training(axes, curves(scene, k), base["psnr"])
-            axes.set_title(f"s = {s:g}", loc="left", fontsize=10, weight="bold")
-            axes.get_legend().remove()
-        # one legend for all panels
-        named = axes.get_legend_handles_labels()
-        figure.legend(*named, loc="outside lower center", ncols=len(LABELS) + 1)
+def plot():
+    """A row a scene, a panel a dial value or budget: error against seconds."""
+    inches = (4.6 * len(DIALS), 4.4 * len(PANELS))
+    with new_figure(inches, layout="constrained") as figure:
+        for part, scene in zip(figure.subfigures(len(PANELS)), PANELS, strict=True):
+            runs = last(FILE, "method", "iters", scene=scene)
+            base = next(iter(runs.values())).get("base")
+            part.suptitle(scene, fontsize=11.5, weight="bold", x=0.008, ha="left")
+            for k, axes in enumerate(part.subplots(1, len(DIALS))):
+                draw_training(axes, curves(runs, k), base and base["psnr"])
+                axes.set_title(PANELS[scene][k], loc="left", fontsize=10, weight="bold")
+                axes.get_legend().remove()
+            # one legend for all panels
+            named = axes.get_legend_handles_labels()
+            part.legend(*named, loc="outside lower center", ncols=len(LABELS))
         save_figure(figure, PICTURE)
     print(PICTURE)
 

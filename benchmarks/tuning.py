@@ -78,13 +78,7 @@ def tune(start, views, config):
 
 
 @torch_on_one_thread()
-def _gradients(
-    start,
-    parameters,
-    tuned,
-    view,
-    prefix,
-):
+def _gradients(start, parameters, tuned, view, prefix):
     leaves = {
         name: value.detach().requires_grad_(name in tuned) for name, value in parameters.items()
     }
