@@ -5,11 +5,11 @@ dial value on held-out photographs; ours and halved sets on a large scene.
     python benchmarks/tradeoff.py    # docs/images/error_vs_time.png of the stored rows
 
 Each number of steps is a separate run with its own schedule. A specialist is the base merged to the
-count that ours keeps at that dial value, by the better of splat-transform's methods, then tuned for
-as many steps; at s = 1 the whole base, tuned. Prefixes are one file, ordered by removal error and
-tuned with random prefixes, of which the same counts are measured. SCENE.ply, without photographs,
-is drawn by the rule of ``stream.py``, and a time is that of the whole command. Each run adds a row
-to ``results/tradeoff.jsonl``.
+count that ours keeps at that dial value, by splat-transform, then tuned for as many steps; at s = 1
+it is the whole base. Prefixes are one file, ordered by removal error and tuned with random
+prefixes, of which the same counts are measured. SCENE.ply, without photographs, is drawn by the
+rule of ``stream.py``, and times are of the whole command, also at its default. Rows go to
+``results/tradeoff.jsonl``.
 """
 
 import tempfile
@@ -68,8 +68,8 @@ def of_capture(scene):
     (untouched,) = quality(base.gaussians, views.test, 1.0)
     METHODS["ours"](scene, base, views, 1)  # compiles
     for method, iters in product(METHODS, ITERS):
-        about = {"method": method, "iters": iters, "max_sv": MAX_SV, "base": untouched}
         seconds, rows = METHODS[method](scene, base, views, iters)
+        about = {"method": method, "iters": iters, "base": untouched}
         yield about | {"seconds": seconds, "rows": rows}
 
 
@@ -78,10 +78,10 @@ def of_file(scene):
     base = clod.load(scene).gaussians
     views = rendered(base)
     with tempfile.TemporaryDirectory() as temporary:
-        for iters in ITERS:
+        for iters in (*ITERS, "default"):
             out = Path(temporary) / f"{iters}.ply"
-            words = ["--iters", iters, "--out", out, "--accept-loss", "--quiet"]
-            run = clod_adapt(scene, *words)
+            words = [] if iters == "default" else ["--iters", iters]
+            run = clod_adapt(scene, *words, "--out", out, "--accept-loss", "--quiet")
             shown = Dial(clod.load(out).gaussians)
             rows = [measured(shown, views, budget, len(base)) for budget in BUDGETS]
             seconds = [run.seconds] * len(BUDGETS)
@@ -147,28 +147,23 @@ def counts(scene):
 
 def curves(runs, k):
     """Lines by method in the k-th panel, by rising time."""
-    points = {}
-    for (method, _), row in sorted(runs.items()):
+    lines = {method: [] for method in LABELS}
+    for row in sorted(runs, key=lambda row: row["seconds"][k]):
         point = {"seconds": row["seconds"][k], "psnr": row["rows"][k]["psnr"]}
-        points.setdefault(method, []).append(point)
-    return [
-        {"label": label, "points": points[method]}
-        for method, label in LABELS.items()
-        if method in points
-    ]
+        lines[row["method"]].append(point)
+    return [{"label": LABELS[method], "points": line} for method, line in lines.items() if line]
 
 
 def plot():
     """A row a scene, a panel a dial value or budget: error against seconds."""
-    inches = (4.6 * len(DIALS), 4.4 * len(PANELS))
-    with new_figure(inches, layout="constrained") as figure:
+    with new_figure((13.8, 4.4 * len(PANELS)), layout="constrained") as figure:
         for part, scene in zip(figure.subfigures(len(PANELS)), PANELS, strict=True):
-            runs = last(FILE, "method", "iters", scene=scene)
-            base = next(iter(runs.values())).get("base")
-            part.suptitle(scene, fontsize=11.5, weight="bold", x=0.008, ha="left")
+            runs = last(FILE, "method", "iters", scene=scene).values()
+            base = next(iter(runs)).get("base")
+            part.suptitle(scene, weight="bold", x=0.008, ha="left")
             for k, axes in enumerate(part.subplots(1, len(DIALS))):
                 draw_training(axes, curves(runs, k), base and base["psnr"])
-                axes.set_title(PANELS[scene][k], loc="left", fontsize=10, weight="bold")
+                axes.set_title(PANELS[scene][k], loc="left", weight="bold")
                 axes.get_legend().remove()
             # one legend for all panels
             named = axes.get_legend_handles_labels()
