@@ -44,8 +44,6 @@ CHOICES = {  # name and value, and what the table calls it
     ("full", 0.5): "half of the first steps at s = 1",
     ("coarse", 0.0): "no step with photographs of half the size",
     ("growth", "off"): "no growth",
-    ("lr_means", 0.03): "half the rate of means",
-    ("lr_means", 0.12): "twice",
 }
 PLACED = {  # without photographs
     ("default", None): "default",
