@@ -104,12 +104,15 @@ def sets_of(scene, author, adapted, folder):
     rivals = {name: halved(scene, option, folder / name) for name, option in SETS.items()}
     if author:
         rivals["author"] = author
-    sets = {}
-    for name, coarser in rivals.items():
-        levels = [clod.load(file).gaussians for file in (scene, *coarser)]
-        sets[name] = dict.fromkeys(MULTIPLIERS, levels)
+    sets = {name: of_files(scene, coarser) for name, coarser in rivals.items()}
     sets["lod-meta"] = {each: own_levels(adapted, each) for each in MULTIPLIERS}
     return sets
+
+
+def of_files(scene, coarser):
+    """Their levels, the same for each multiplier."""
+    levels = [clod.load(file).gaussians for file in (scene, *coarser)]
+    return dict.fromkeys(MULTIPLIERS, levels)
 
 
 def of_plain(adapted, sets, views, whole):

@@ -30,7 +30,7 @@ from common import (
     photographs,
     quality,
 )
-from stream import BUDGETS, MULTIPLIERS, SETS, Dial, halved, measured, of_sets, rendered
+from stream import BUDGETS, SETS, Dial, halved, measured, of_files, of_sets, rendered
 from tuning import Tuning, by_importance, merge, tune
 
 FILE = "tradeoff.jsonl"
@@ -88,11 +88,9 @@ def of_file(scene):
             yield {"method": "ours", "iters": iters, "seconds": seconds, "rows": rows}
         for method, option in SETS.items():
             began = time.perf_counter()
-            files = halved(scene, option, Path(temporary) / method)
+            coarser = halved(scene, option, Path(temporary) / method)
             seconds = [time.perf_counter() - began] * len(BUDGETS)
-            levels = [clod.load(file).gaussians for file in (scene, *files)]
-            sets = {method: dict.fromkeys(MULTIPLIERS, levels)}
-            rows = list(of_sets(base, sets, views))
+            rows = list(of_sets(base, {method: of_files(scene, coarser)}, views))
             yield {"method": method, "seconds": seconds, "rows": rows}
 
 
