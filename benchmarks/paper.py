@@ -2,13 +2,13 @@
 
     python benchmarks/paper.py plush_half demo    # captures; the folder of clod-adapt demo
 
-Ablations: ``AdaptConfig.paper(max_sv=5)`` without the weight ``w_s``, without ``L_reg``, and
-without both. Levels: four strips of a picture from coarse to fine. Continuous is one file of this
-package at the dial values DIALS. Discrete is two models, two strips each: the base merged to the
-count of DIALS[0] and tuned for it, and the base; on average they draw as many Gaussians. A seam is
-the RMS difference, in 8-bit levels, between the renders of the two models that meet at a boundary
-of strips, in the columns next to it. Each run adds rows to ``results/paper.jsonl``; the demo is
-also drawn, to docs/images/strips.webp.
+Ablations: ``AdaptConfig.paper(max_sv=5)`` without the weight ``w_s``, without ``L_reg``, without
+both, and from another start. Levels: four strips of a picture from coarse to fine. Continuous is
+one file of this package at the dial values DIALS. Discrete is two models, two strips each: the base
+merged to the count of DIALS[0] and tuned for it, and the base; on average they draw as many
+Gaussians. A seam is the RMS difference, in 8-bit levels, between the renders of the two models that
+meet at a boundary of strips, in the columns next to it. Each run adds rows to
+``results/paper.jsonl``; the demo is also drawn, to docs/images/strips.webp.
 """
 
 from itertools import pairwise
@@ -29,11 +29,13 @@ FILE, PICTURE = "paper.jsonl", ROOT / "docs" / "images" / "strips.webp"
 MAX_SV, SHOWN = 5.0, (1.0, 3.0, 5.0)
 DIALS = (5.0, 2.0, 1.0, 0.0)  # of the strips, from left to right
 EDGE = 8  # columns on each side of a boundary
-ABLATIONS = {  # slope of w_s, and weight of L_reg
-    "as published": (PaperDial.weight_slope, 1.0),
-    "without `w_s`": (0.0, 1.0),
-    "without `L_reg`": (PaperDial.weight_slope, 0.0),
-    "without both": (0.0, 0.0),
+SLOPE = PaperDial.weight_slope
+ABLATIONS = {  # slope of w_s, weight of L_reg, and sigma_d at the start
+    "as published": (SLOPE, 1.0, 1.0),
+    "without `w_s`": (0.0, 1.0, 1.0),
+    "without `L_reg`": (SLOPE, 0.0, 1.0),
+    "without both": (0.0, 0.0, 1.0),
+    "from `sigma_d` = max_sv": (SLOPE, 1.0, MAX_SV),
 }
 
 
@@ -54,10 +56,12 @@ def main():
 
 
 def ablations(base, views):
-    for label, (slope, weight) in ABLATIONS.items():
+    for label, (slope, weight, start) in ABLATIONS.items():
         config = clod.AdaptConfig.paper(max_sv=MAX_SV, reg_weight=weight)
+        begun = PaperDial.begin(base.gaussians, views.train, config)
+        begun = begun.replace(sigma_d=start * begun.sigma_d)
         with patch.object(PaperDial, "weight_slope", slope):
-            gaussians = clod.adapt(base.gaussians, views, config).gaussians
+            gaussians = clod.adapt(begun, views, config).gaussians
         yield {"label": label, "rows": quality(gaussians, views.test, SHOWN)}
 
 
@@ -83,25 +87,22 @@ def compare(models, views):
         drawn = [clod.render(model, view.camera, virtual_scale=s) for model, s in models]
         images = [each.image.clamp(0, 1) for each in drawn]
         kept.append(np.mean([int(each.kept.sum()) for each in drawn]))
-        edges = [round(k * view.camera.width / len(models)) for k in range(len(models) + 1)]
+        edges = np.linspace(0, view.camera.width, len(models) + 1).round().astype(int)
         strips = [slice(*ends) for ends in pairwise(edges)]
-        pairs = [
-            (image[:, strip], view.image[:, strip])
-            for image, strip in zip(images, strips, strict=True)
-        ]
-        errors.append([mean_squared_error(*pair) for pair in pairs])
+        parts = [image[:, strip] for image, strip in zip(images, strips, strict=True)]
+        truths = [view.image[:, strip] for strip in strips]
+        errors.append(list(map(mean_squared_error, parts, truths)))
         seams.append([])
         for (left, right), edge in zip(pairwise(images), edges[1:-1], strict=True):
             near = slice(edge - EDGE, edge + EDGE)
             difference = (left[:, near] - right[:, near]).square().mean().sqrt()
             seams[-1].append(255 * float(difference))
-    joined = torch.cat([image[:, strip] for image, strip in zip(images, strips, strict=True)], 1)
     row = {
         "strips": [decibels(error) for error in np.mean(errors, 0)],
         "seams": np.mean(seams, 0).tolist(),
         "kept": float(np.mean(kept)),
     }
-    return row, (255 * joined).round().byte().numpy()
+    return row, (255 * torch.cat(parts, 1)).round().byte().numpy()
 
 
 def page_table():
