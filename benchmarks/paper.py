@@ -18,7 +18,7 @@ from unittest.mock import patch
 import clod_adapter as clod
 from clod_adapter.losses import decibels, mean_squared_error
 from clod_adapter.training.paper import PaperDial
-from common import ROOT, Table, append, arguments, last, opened, quality
+from common import ROOT, Table, append, arguments, last, opened, psnr_kept, quality
 from tuning import merge
 
 import numpy as np
@@ -110,9 +110,8 @@ def page_table():
     found = last(FILE, "scene", "label", kind="ablation")
     lines = []
     for key, row in found.items():
-        cells = [f"{at['psnr']:.2f}, {at['kept_share']:.0%}" for at in row["rows"]]
-        lines.append([", ".join(key), *cells])
-    return Table(["PSNR, share kept", *(f"s = {s:g}" for s in SHOWN)], lines, found.values())
+        lines.append([", ".join(key), *map(psnr_kept, row["rows"])])
+    return Table(["", *(f"s = {s:g}" for s in SHOWN)], lines, found.values())
 
 
 def strips_table():

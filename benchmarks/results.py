@@ -64,8 +64,6 @@ for module, parts in (
 ):
     for part in parts:
         TABLES[f"{module.__name__}-{part}"] = partial(module.page_table, part)
-for part in stream.PLAIN:
-    TABLES[f"plain-{part}"] = partial(stream.plain_table, part)
 
 
 @dataclass(frozen=True, kw_only=True)

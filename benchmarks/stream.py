@@ -48,7 +48,6 @@ SCENES = {  # of the tables
     "plush_half": "a plush toy, 120,000, photographs",
     "bonsai146": "a table in a room, 150,000, photographs",
 }
-PLAIN = ("playbot", "showroom3")  # of the tables of plain files
 SHOWN = {
     "dial": "this dial, one file",
     "lod-meta": "this file's levels, `export --lod-meta`",
@@ -309,21 +308,6 @@ def page_table(scene):
             ]
     heads = [f"{SCENES[scene]} (`{scene}`), budget", *percent(BUDGETS)]
     return Table(heads, with_best(lines, ".1f"), rows)
-
-
-def plain_table(scene):
-    """Plain files, drawn as they are."""
-    found = last(FILE, "method", "level", scene=scene)
-    shares = [1 / 2**k for k in range(1, HALVED + 1)]
-    ways = {"plain": "`export --keep`"}
-    for name in SETS:
-        ways[f"{name}, plain"] = SHOWN[name]
-    rows, lines = [], {}
-    for method, label in ways.items():
-        line = [found[method, f"{share:.0%}"] for share in shares]
-        rows += line
-        lines[label] = [row["psnr"] for row in line]
-    return Table([f"`{scene}`, plain files", *percent(shares)], with_best(lines, ".1f"), rows)
 
 
 if __name__ == "__main__":
