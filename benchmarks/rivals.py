@@ -3,7 +3,7 @@
     python benchmarks/rivals.py plush_half bonsai146 --iters 1500
 
 - ``merging``: ``splat-transform``, both of its methods, without training, one file per count;
-- ``specialist``: the merged file, tuned for that count alone;
+- ``specialist``: each merged file, tuned for that count alone;
 - ``tuned``: the whole base, tuned for as many steps;
 - ``prefix``: one file whose prefixes are the counts, by removal error, tuned with random prefixes
   (``tuning.tune``);
@@ -16,6 +16,7 @@ A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl`
 
 import tempfile
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 
 import adapt
@@ -41,10 +42,11 @@ from tuning import MERGINGS, Tuning, by_importance, find_tool, merge, tune
 FILE = "rivals.jsonl"
 RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking", "kept")
 MAX_SV = 20  # of the adapted file
-SHOWN = {  # in the table, by rival and end of the label
-    ("kept", ""): "exported from it, a plain file each",
+SHOWN = {  # in the table, by rival and last option in the label
+    ("kept", "--keep"): "exported from it, a plain file each",
     ("kept", "--tune"): "exported and tuned",
-    ("specialist", ""): "specialist, a file each",
+    ("specialist", "--decimate"): "specialist, uniform",
+    ("specialist", "--decimate-adaptive"): "specialist, adaptive",
     ("prefix", ""): "prefixes, one file",
     ("merging", "--decimate"): "merging, uniform",
     ("merging", "--decimate-adaptive"): "merging, adaptive",
@@ -98,11 +100,11 @@ def contest(rival, base, folder, views, iters):
             label = f"splat-transform {find_tool().version} {method}"
             yield label, files, {"merge_seconds": seconds}
     elif rival == "specialist":
-        for share, count in counts.items():
-            start, merging = merge(base, count)
+        for method, (share, count) in product(MERGINGS, counts.items()):
+            start, merging = merge(base, count, method)
             tuned, seconds = tune(start, train, config)
             more = {"train_seconds": seconds, "merge_seconds": merging}
-            yield f"merged {MERGINGS[0]}, then tuned", {share: tuned}, about | more
+            yield f"merged {method}, then tuned", {share: tuned}, about | more
     elif rival == "tuned":
         tuned, seconds = tune(gaussians, train, config)
         yield "tuned base", {1.0: tuned}, about | {"train_seconds": seconds}
@@ -146,9 +148,8 @@ def page_table(scene):
     rows = {}
     for row in stored(FILE):
         if row["scene"] == scene:
-            way = row["label"].split()[-1]
-            way = way if way.startswith("--") else ""
-            label = SHOWN[row["rival"], way]
+            options = [word.strip(",") for word in row["label"].split() if word.startswith("--")]
+            label = SHOWN[row["rival"], options[-1] if options else ""]
             for point in row["rows"]:
                 found[label][point["share"]] = point["psnr"]
                 rows[label, point["share"]] = row

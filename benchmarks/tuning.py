@@ -116,7 +116,7 @@ def find_tool():
 MERGINGS = ("--decimate-adaptive", "--decimate")
 
 
-def merge(base, count, method=MERGINGS[0]):
+def merge(base, count, method):
     """The base merged to ``count`` Gaussians, and the seconds that the tool took, then or now.
 
     Args:
