@@ -152,6 +152,15 @@ def curves(runs, k):
     return [{"label": LABELS[method], "points": line} for method, line in lines.items() if line]
 
 
+def title(runs, scene, k):
+    """Of the k-th panel, with the share kept: by all but the paper's form as many as by ours."""
+    longest_last = sorted(runs, key=lambda row: row["seconds"][k])
+    kept = {row["method"]: row["rows"][k].get("kept_share") for row in longest_last}
+    if "paper" not in kept:
+        return PANELS[scene][k]
+    return f"{PANELS[scene][k]}, {kept['ours']:.0%} (the paper's form {kept['paper']:.0%})"
+
+
 def plot():
     """A row a scene, a panel a dial value or budget: error against seconds."""
     with new_figure((13.8, 4.4 * len(PANELS)), layout="constrained") as figure:
@@ -161,7 +170,7 @@ def plot():
             part.suptitle(scene, weight="bold", x=0.008, ha="left")
             for k, axes in enumerate(part.subplots(1, len(DIALS))):
                 draw_training(axes, curves(runs, k), base and base["psnr"])
-                axes.set_title(PANELS[scene][k], loc="left", weight="bold")
+                axes.set_title(title(runs, scene, k), loc="left", weight="bold")
                 axes.get_legend().remove()
             # one legend for all panels
             named = axes.get_legend_handles_labels()
