@@ -144,18 +144,19 @@ def counts(scene):
 
 
 def curves(runs, k):
-    """Lines by method in the k-th panel, by rising time."""
+    """Lines by method in the k-th panel, through runs by rising time."""
     lines = {method: [] for method in LABELS}
-    for row in sorted(runs, key=lambda row: row["seconds"][k]):
+    for row in runs:
         point = {"seconds": row["seconds"][k], "psnr": row["rows"][k]["psnr"]}
         lines[row["method"]].append(point)
     return [{"label": LABELS[method], "points": line} for method, line in lines.items() if line]
 
 
 def title(runs, scene, k):
-    """Of the k-th panel, with the share kept: by all but the paper's form as many as by ours."""
-    longest_last = sorted(runs, key=lambda row: row["seconds"][k])
-    kept = {row["method"]: row["rows"][k].get("kept_share") for row in longest_last}
+    """Of the k-th panel, with the shares that the last runs of ours and of the paper's form keep;
+    the others keep as many as ours, specialists at s = 1 all.
+    """
+    kept = {row["method"]: row["rows"][k].get("kept_share") for row in runs}
     if "paper" not in kept:
         return PANELS[scene][k]
     return f"{PANELS[scene][k]}, {kept['ours']:.0%} (the paper's form {kept['paper']:.0%})"
@@ -169,8 +170,9 @@ def plot():
             base = next(iter(runs)).get("base")
             part.suptitle(scene, weight="bold", x=0.008, ha="left")
             for k, axes in enumerate(part.subplots(1, len(DIALS))):
-                draw_training(axes, curves(runs, k), base and base["psnr"])
-                axes.set_title(title(runs, scene, k), loc="left", weight="bold")
+                by_time = sorted(runs, key=lambda row: row["seconds"][k])
+                draw_training(axes, curves(by_time, k), base and base["psnr"])
+                axes.set_title(title(by_time, scene, k), loc="left", weight="bold")
                 axes.get_legend().remove()
             # one legend for all panels
             named = axes.get_legend_handles_labels()
