@@ -7,21 +7,25 @@ budgets.
 
 SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
 again and again by splat-transform (``make peers``) in both its ways, and the author's own. The
-levels of ``export --lod-meta`` are drawn too. No set is packed. A set is drawn by the rule of
-PlayCanvas 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is that of
-the nearest point of its box, times up to BEHIND where that is behind the camera; level b >= 1
-begins at K multiplier^(b - 1); in each frame one K for all nodes is such that their counts, in view
-or not, meet the budget. A set has the multiplier of MULTIPLIERS that is best for it. The dial has
-the value that keeps as many Gaussians in that frame, in view or not, by distances with the same
-factor; "all alike" is without the factor. Plain files are drawn as they are: each halved one, and
-``export --keep`` of its count. PSNR is that of the mean squared error over VIEWS placed cameras,
-four times as many for plain files, against renders of SCENE, or over held-out photographs.
+levels of ``export --lod-meta`` are drawn too. No set is packed. Above ADAPTIVE Gaussians a set
+halved adaptively is left out: without a GPU splat-transform cannot make it.
+
+A set is drawn by the rule of PlayCanvas 2.23 (gsplat-octree-instance.js,
+gsplat-budget-balancer.js): a node's distance is that of the nearest point of its box, times up to
+BEHIND where that is behind the camera; level b >= 1 begins at K multiplier^(b - 1); in each frame
+one K for all nodes is such that their counts, in view or not, meet the budget. A set has the
+multiplier of MULTIPLIERS that is best for it. The dial has the value that keeps as many Gaussians
+in that frame, in view or not, by distances with the same factor; "all alike" is without the factor.
+Plain files are drawn as they are: each halved one, and ``export --keep`` of its count. PSNR is that
+of the mean squared error over VIEWS placed cameras, four times as many for plain files, against
+renders of SCENE, or over held-out photographs.
 """
 
 import json
 import math
 import tempfile
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -37,6 +41,7 @@ import torch
 FILE, VIEWS, SEED = "stream.jsonl", 16, 77
 BUDGETS, MULTIPLIERS = (0.4, 0.18, 0.08, 0.04), (1.6, 2.0, 3.0)
 LEAF, HALVED = 8192, 6  # Gaussians of a node; times that SCENE is halved
+ADAPTIVE = 1 << 21
 BEHIND = 1.5  # factor of the distance of what is straight behind the camera: lodBehindPenalty
 SETS = {"halved": "--decimate", "halved adaptively": "--decimate-adaptive"}
 SCENES = {  # of the tables
@@ -82,7 +87,7 @@ def main():
         for row in of_dial(base, out, views):
             append(FILE, {"scene": scene, **row}, args.record)
         sets = sets_of(args.scene, args.author, clod.load(out).gaussians, folder)
-        for row in (*of_plain(out, sets, more, len(base)), *of_sets(base, sets, views)):
+        for row in chain(of_plain(out, sets, more, len(base)), of_sets(base, sets, views)):
             append(FILE, {"scene": scene, **row}, args.record)
 
 
@@ -100,7 +105,10 @@ def of_dial(base, adapted, views):
 
 def sets_of(scene, author, adapted, folder):
     """The levels of each set for each multiplier, the finest first."""
-    rivals = {name: halved(scene, option, folder / name) for name, option in SETS.items()}
+    options = dict(SETS)
+    if len(clod.load(scene).gaussians) > ADAPTIVE:
+        del options["halved adaptively"]
+    rivals = {name: halved(scene, option, folder / name) for name, option in options.items()}
     if author:
         rivals["author"] = author
     sets = {name: of_files(scene, coarser) for name, coarser in rivals.items()}
@@ -116,7 +124,7 @@ def of_files(scene, coarser):
 
 def of_plain(adapted, sets, views, whole):
     """Plain files of the same counts, drawn everywhere: ``export --keep``, and the merged ones."""
-    for name in SETS:
+    for name in filter(sets.get, SETS):
         for merged in sets[name][MULTIPLIERS[0]][1:]:
             share = len(merged) / whole
             yield {"method": f"{name}, plain", **measured(Plain(merged), views, share, whole)}
