@@ -118,8 +118,8 @@ def captured():
 def attenuated(capture, tmp_path_factory):
     """The capture's checkpoint with a dial up to 4 and its quality table, as clod-adapt writes."""
     path = tmp_path_factory.mktemp("attenuated") / "dial.ply"
-    words = f"{capture.ply} --images {capture.scene} --iters 12 --max-sv 4 --out {path} --quiet"
-    assert main(accepted(words.split())) == 0
+    words = [capture.ply, "--images", capture.scene, "--iters", 12, "--max-sv", 4, "--out", path]
+    assert main(accepted([*words, "--quiet"])) == 0
     return path
 
 

@@ -1,6 +1,7 @@
 """Photographs and their COLMAP models, shared by the tests of readers."""
 
 import json
+import os
 
 import numpy as np
 import pycolmap
@@ -51,10 +52,11 @@ def write_scene(folder, count=10):
 
 
 def write_images(folder, names):
-    """The ``pixels`` of 0, 1, 2, ..."""
+    """The ``pixels`` of 0, 1, 2, ... Names are UTF-8 on disk, whatever the locale."""
     for i, name in enumerate(names):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels(i)).save(folder / name)
+        path = folder / os.fsdecode(name.encode())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels(i)).save(path)
 
 
 def to_world(seed):

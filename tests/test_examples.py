@@ -196,8 +196,8 @@ def test_an_exponent_is_that_of_the_power():
 
 def test_plush_and_city_small(monkeypatch, tmp_path):
     out = tmp_path / "gpu.jsonl"
-    words = f"gpu.py --device cpu --small --only plush city --results {out}"
-    monkeypatch.setattr(sys, "argv", words.split())
+    words = ["gpu.py", "--device", "cpu", "--small", "--only", "plush", "city", "--results"]
+    monkeypatch.setattr(sys, "argv", [*words, str(out)])
     gpu.main()
     plush, adapted, *frames = map(json.loads, out.read_text("utf-8").splitlines())
     assert (plush["benchmark"], plush["on"], plush["count"]) == ("gpu plush", "cpu", 1000)

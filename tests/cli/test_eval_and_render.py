@@ -2,6 +2,7 @@
 views, interrupts.
 """
 
+import os
 import re
 import signal
 from dataclasses import replace
@@ -195,7 +196,7 @@ def test_device_presets_are_counts(clod, capture, attenuated, monkeypatch):
     done = clod("export DIAL --device-preset quest3 -o few.ply --json")
     assert 115 <= done.report["outputs"][0]["count"] == len(load("few.ply").gaussians) <= 120
     assert done.note("preset").startswith("--device-preset quest3, --keep 120: s = ")
-    words = f"{attenuated} --images {capture.scene} --device-preset quest3".split()
+    words = [str(attenuated), "--images", str(capture.scene), "--device-preset", "quest3"]
     answers, report = view.make_page(build_parser("view").parse_args(words), view.Console(True))
     page = b"".join(answers["/"].blocks()).decode()
     opening = float(re.findall(r'"virtual_scale": ([\d.]+)[,}]', page)[-1])
@@ -248,11 +249,11 @@ def test_interrupts(clod, tmp_path, monkeypatch, presses):
 
 
 def test_image_names(capture):
-    """Names that are equal without their suffixes keep them."""
+    """In UTF-8; names that are equal without their suffixes keep them."""
     view = load_scene(capture.scene).test[0]
     for photographs, files in (
         (("ä.jpg", "b/ä.jpg", "c\\ä.JPG"), ["ä.png", "b/ä.png", "c/ä.png"]),
         (("a.jpg", "a.png"), ["a.jpg.png", "a.png.png"]),
     ):
         views = [replace(view, camera=replace(view.camera, name=name)) for name in photographs]
-        assert [str(path) for path in command.image_names(views)] == files
+        assert [os.fsencode(path).decode() for path in command.image_names(views)] == files

@@ -22,8 +22,8 @@ ITERS = 24
 
 @pytest.fixture(scope="module")
 def words(capture):
-    line = f"{capture.ply} --images {capture.scene} --iters {ITERS} --max-sv 4 --out dial.ply"
-    return line.split()
+    options = f"--iters {ITERS} --max-sv 4 --out dial.ply"
+    return [capture.ply, "--images", capture.scene, *options.split()]
 
 
 @pytest.fixture(scope="module")

@@ -66,8 +66,8 @@ def test_errors_of_the_work(clod, monkeypatch, error, code, said):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
 @pytest.mark.parametrize("words", ["inspect PLY --json", "--help"])
 def test_results_that_cannot_be_printed_are_an_error(capture, words):
-    words = words.replace("PLY", str(capture.ply)).split()
-    command = [sys.executable, "-m", "clod_adapter", *words]
+    given = [str(capture.ply) if word == "PLY" else word for word in words.split()]
+    command = [sys.executable, "-m", "clod_adapter", *given]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
     said = (

@@ -36,8 +36,8 @@ def assert_holds(data, file, folder):
 
 
 def test_serves_until_it_is_interrupted(server, capture, attenuated, tmp_path):
-    line = f"view {attenuated} --base {capture.ply} --images {capture.scene} --sv 2 --no-browser"
-    process = server.start(tmp_path, *line.split(), "--json", "--quiet")
+    words = ["view", attenuated, "--base", capture.ply, "--images", capture.scene, "--sv", 2]
+    process = server.start(tmp_path, *words, "--no-browser", "--json", "--quiet")
     wait_for(Path(f"{tmp_path}.log"), "\n")
     report = json.loads(log_of(tmp_path))
     assert report["url"] == f"http://127.0.0.1:{report['port']}/" and report["cameras"] == 10

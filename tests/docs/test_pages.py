@@ -193,9 +193,10 @@ def keys(value):
 def test_every_field_of_the_reports_is_explained(desk, capsys):
     explained = set(re.findall(r"`([a-z_0-9]+)`", (DOCS / "python.md").read_text("utf-8")))
     base = desk / "pretrained.ply"
-    line = f"eval {desk}/pretrained_clod.ply --images {desk}/scene --sv 1 3 --popping --quiet"
+    words = ["eval", desk / "pretrained_clod.ply", "--images", desk / "scene", "--base", base]
+    options = "--sv 1 3 --popping --quiet --json --against"
     capsys.readouterr()
-    assert main(f"{line} --base {base} --against {base} --json".split()) == 0
+    assert main([*map(str, words), *options.split(), str(base)]) == 0
     measured = json.loads(capsys.readouterr().out)
     adapted = json.loads(desk.joinpath("pretrained_clod.json").read_text("utf-8"))
     assert {"rows", "alignment", "frame_ms"} <= set(keys(adapted))

@@ -28,7 +28,7 @@ NAME = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
 def test_parts_are_built_from_these_sources():
     """After a change of the sources: npm ci && npm run build, in clod_adapter/viewer/web."""
     texts = {
-        name: (VIEWER / "static" / name).read_text()
+        name: (VIEWER / "static" / name).read_text("utf-8")
         for name in ("page.html", "viewer.css", "viewer.js")
     }
     for name, text in texts.items():
