@@ -4,6 +4,7 @@ paper's form.
 
 import itertools
 import math
+import os
 
 import mpmath
 import pytest
@@ -48,13 +49,15 @@ def opacity(logit):
 
 def test_errors_are_within_the_bounds_that_the_module_states():
     """Drawn opacities, growth and their gradients on the benchmark's random inputs, over all
-    magnitudes and from far inside the reach to just beyond it. Half as much again is allowed, as
-    elementary functions of other machines may be an ulp less exact.
+    magnitudes and from far inside the reach to just beyond it. Where ``other_libm`` moves the
+    elementary functions by an ulp, half as much again is allowed.
     """
+    moved = "OTHER_LIBM" in os.environ
     rows = stability_equation.measure()
     assert len(rows) == len(DTYPES) * len(stability_equation.BOUNDS)
     for row in rows:
-        assert row["nan"] == 0 and row["worst_of_bound"] < 1.5 and row["points"] > 9000, row
+        assert row["failed"] == 0 or (moved and row["worst_of_bound"] < 1.5), row
+        assert row["nan"] == 0 and row["points"] > 9000, row
 
 
 @each_dtype
