@@ -189,11 +189,8 @@ def test_names_that_are_not_utf8(clod, capture, attenuated, tmp_path):
     for file, name in ((capture.ply, ".ply"), (attenuated, "_dial.ply")):
         shutil.copy(file, folder / f"{ODD}{name}")
     for line in OF_ODD_NAMES.strip().splitlines():
-        words = [
-            word.replace("ODD", str(folder / ODD)).replace("OUT", str(folder / "out" / ODD))
-            for word in line.split()
-        ]
-        done = clod(*map(Path, words), "--quiet --json")  # a Path is one word
+        words = line.replace("ODD", f"{ODD}/{ODD}").replace("OUT", f"{ODD}/out/{ODD}")
+        done = clod(words, "--quiet --json")
         assert "gr\\xfcn/gr\\xfcn" in json.dumps(done.report).replace("\\\\", "\\")
     for path in folder.glob("out/*.[hj][ts][mo][ln]"):  # pages and reports
         assert "gr\\xfcn" in path.read_text("utf-8").replace("\\\\", "\\"), path
