@@ -8,17 +8,15 @@ budgets.
 SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
 again and again by splat-transform (``make peers``) in both its ways, and the author's own. The
 levels of ``export --lod-meta`` are drawn too. No set is packed. Above ADAPTIVE Gaussians a set
-halved adaptively is left out: without a GPU splat-transform cannot make it.
-
-A set is drawn by the rule of PlayCanvas 2.23 (gsplat-octree-instance.js,
-gsplat-budget-balancer.js): a node's distance is that of the nearest point of its box, times up to
-BEHIND where that is behind the camera; level b >= 1 begins at K multiplier^(b - 1); in each frame
-one K for all nodes is such that their counts, in view or not, meet the budget. A set has the
-multiplier of MULTIPLIERS that is best for it. The dial has the value that keeps as many Gaussians
-in that frame, in view or not, by distances with the same factor; "all alike" is without the factor.
-Plain files are drawn as they are: each halved one, and ``export --keep`` of its count. PSNR is that
-of the mean squared error over VIEWS placed cameras, four times as many for plain files, against
-renders of SCENE, or over held-out photographs.
+halved adaptively is left out: without a GPU splat-transform cannot make it. A set is drawn by the
+rule of PlayCanvas 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is
+that of the nearest point of its box, times up to BEHIND where that is behind the camera; level b >=
+1 begins at K multiplier^(b - 1); in each frame one K for all nodes is such that their counts, in
+view or not, meet the budget. A set has the multiplier of MULTIPLIERS that is best for it. The dial
+has the value that keeps as many Gaussians in that frame, in view or not, by distances with the same
+factor; "all alike" is without the factor. Plain files are drawn as they are: each halved one, and
+``export --keep`` of its count. PSNR is that of the mean squared error over VIEWS placed cameras,
+four times as many for plain files, against renders of SCENE, or over held-out photographs.
 """
 
 import json
@@ -86,7 +84,7 @@ def main():
         append(FILE, {"scene": scene, **row}, args.record)
         for row in of_dial(base, out, views):
             append(FILE, {"scene": scene, **row}, args.record)
-        sets = sets_of(args.scene, args.author, clod.load(out).gaussians, folder)
+        sets = sets_of(args.scene, args.author, base, clod.load(out).gaussians, folder)
         for row in chain(of_plain(out, sets, more, len(base)), of_sets(base, sets, views)):
             append(FILE, {"scene": scene, **row}, args.record)
 
@@ -103,10 +101,10 @@ def of_dial(base, adapted, views):
             yield {"method": name, **measured(Dial(model, behind), views, budget, len(base))}
 
 
-def sets_of(scene, author, adapted, folder):
+def sets_of(scene, author, base, adapted, folder):
     """The levels of each set for each multiplier, the finest first."""
     options = dict(SETS)
-    if len(clod.load(scene).gaussians) > ADAPTIVE:
+    if len(base) > ADAPTIVE:
         del options["halved adaptively"]
     rivals = {name: halved(scene, option, folder / name) for name, option in options.items()}
     if author:
